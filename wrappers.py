@@ -1,0 +1,221 @@
+"""One function, `make_envs`: Atari, or any Gymnasium environment with discrete actions, as a vector environment.
+
+The training scripts import two names from here and nothing else of the project:
+
+    envs = make_envs("Breakout", num_envs=8)
+    next_obs, _ = envs.reset(seed=env_seeds(seed=1, num_envs=8))
+
+Atari runs in ale-py's C++ threads under Gymnasium's own vector wrappers; `EpisodicLife` is the one behaviour that
+neither has. Whatever else is registered with Gymnasium runs in a `SyncVectorEnv`. Both reset in the step that ends a
+game (`SAME_STEP`): with Gymnasium's default, `NEXT_STEP`, every game would be followed by a dummy transition that
+PPO then trains on.
+"""
+
+import difflib
+import re
+from collections.abc import Sequence
+
+import ale_py
+import gymnasium as gym
+import numpy as np
+from ale_py.vector_env import AtariVectorEnv
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box, Discrete
+from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
+from gymnasium.wrappers import (
+    DtypeObservation,
+    FrameStackObservation,
+    GrayscaleObservation,
+    ReshapeObservation,
+    ResizeObservation,
+    TransformAction,
+)
+from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
+
+gym.register_envs(ale_py)
+
+FRAME_SKIP = 4  # emulator frames shown for each agent step
+SCREEN = (84, 84)  # height and width of an observation, pixels
+STACK = 4  # most recent screens in an observation
+
+
+def make_envs(env_id: str, num_envs: int, num_threads: int = 0, max_frames: int = 108_000) -> VectorEnv:
+    """Builds `num_envs` copies of an environment, stepped together, each reset in the step that ends its game.
+
+    Args:
+        env_id: an Atari game (`Breakout`, `breakout`, `BreakoutNoFrameskip-v4`: the thesis's protocol, without sticky
+            actions; `ALE/Breakout-v5`: the same with its registered sticky actions), or any other registered
+            Gymnasium id, `module:Env-v0` included.
+        num_envs: the number of copies N.
+        num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
+        max_frames: emulator frames after which an Atari game is truncated, its no-ops at the start included.
+
+    Returns:
+        A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
+        float32 (N, D) for flat ones. Rewards: sign-clipped for Atari, as they are elsewhere.
+        Where a game has ended, `info["_episode"]` (N,) is true and `info["episode"]` holds its raw, unclipped score
+        `"r"` and its length `"l"` in agent steps; where it was truncated, `info["final_obs"]` holds the observation
+        that it ended on (rows of other environments are not to be read).
+
+    Raises:
+        ValueError: the environment is unknown, cannot be built, or has spaces that are not supported.
+    """
+    if (atari := find_atari_game(env_id)) is None:
+        return make_gymnasium_envs(env_id, num_envs)
+    rom, repeat_action_probability = atari
+    envs = AtariVectorEnv(
+        rom,
+        num_envs,
+        num_threads=num_threads,
+        max_num_frames_per_episode=max_frames,
+        repeat_action_probability=repeat_action_probability,
+        frameskip=FRAME_SKIP,
+        img_height=SCREEN[0],
+        img_width=SCREEN[1],
+        stack_num=STACK,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+        # These four would each hide something: the rest of a game whose first life is lost, the unclipped score,
+        # and FIRE after a lost life. EpisodicLife and TransformReward below do them, in the right order.
+        episodic_life=False,
+        life_loss_info=False,
+        reward_clipping=False,
+        use_fire_reset=False,
+    )
+    envs = RecordEpisodeStatistics(envs)  # above EpisodicLife it would count lives, above the sign clipped rewards
+    envs = EpisodicLife(envs)
+    return TransformReward(envs, np.sign)
+
+
+def env_seeds(seed: int, num_envs: int) -> list[int]:
+    """Returns a seed for each environment, drawn from one `SeedSequence`: runs with neighbouring seeds share none.
+
+    Gymnasium's own rule, seed, seed + 1, …, gives run 2 seven of the eight environments of run 1. 31 bits, because
+    ale-py refuses larger ones.
+    """
+    return [int(number) for number in np.random.SeedSequence(seed).generate_state(num_envs) >> 1]
+
+
+class EpisodicLife(VectorWrapper):
+    """Reports a lost life as a termination while the game goes on, and presses FIRE where a life starts.
+
+    A lost life is the fall of `info["lives"]` to a number above 0: the last one ends the game itself, and Frogger
+    shows 0 lives for many frames before it does. Games without lives (Pong, DoubleDunk) always show 0. No reset
+    follows, so the next observation is the next one of the same game.
+
+    FIRE replaces the first action of each game and each life, in games that have FIRE: Breakout would stand still
+    until the time limit without it. For the learner, that is an environment whose first action has no effect.
+    """
+
+    def __init__(self, envs: VectorEnv):
+        super().__init__(envs)
+        action_set = envs.unwrapped.ale.get_action_set()
+        self.fire = action_set.index(ale_py.Action.FIRE) if ale_py.Action.FIRE in action_set else None
+
+    def reset(self, *, seed: Sequence[int] | int | None = None, options: dict | None = None):
+        # ale-py takes an int or an array, Gymnasium's SyncVectorEnv an int or a list
+        obs, infos = self.env.reset(seed=np.array(seed) if isinstance(seed, Sequence) else seed, options=options)
+        self.lives = infos["lives"]
+        self.life_starts = np.ones(self.num_envs, dtype=bool)
+        return obs, infos
+
+    def step(self, actions: np.ndarray):
+        if self.fire is not None:
+            actions = np.where(self.life_starts, self.fire, actions)
+        obs, rewards, terminations, truncations, infos = self.env.step(actions)
+        game_over = terminations | truncations
+        # Where the game is over, `lives` already belongs to the next one
+        life_lost = (infos["lives"] < self.lives) & (infos["lives"] > 0) & ~game_over
+        self.lives = infos["lives"]
+        self.life_starts = game_over | life_lost
+        return obs, rewards, terminations | life_lost, truncations, infos
+
+
+def find_atari_game(env_id: str) -> tuple[str, float] | None:
+    """Returns the ROM's name and the probability of sticky actions, or None where `env_id` is not an Atari name.
+
+    Raises:
+        ValueError: an Atari name that cannot be played under the protocol of `make_envs`.
+    """
+    registered = gym.registry.get(env_id)
+    if registered is not None and not is_atari(registered):
+        return None  # Gymnasium's Blackjack-v1 is not Atari's Blackjack
+    if registered is not None and registered.namespace == "ALE":
+        return registered.kwargs["game"], registered.kwargs["repeat_action_probability"]
+
+    name, variant = re.fullmatch(r"(.*?)((?:NoFrameskip|Deterministic|-ram)*(?:-v\d+)?)", env_id, re.DOTALL).groups()
+    key = name.removeprefix("ALE/").replace("_", "").lower()
+    if key in {rom.replace("_", "") for rom in ale_py.roms.get_all_rom_ids()} - atari_specs().keys():
+        raise ValueError("the game has no mode for one player; choose another")
+    if key not in atari_specs():
+        return None
+    spec = atari_specs()[key]
+    if name.startswith("ALE/") or variant not in ("", "NoFrameskip-v4"):
+        raise ValueError(
+            f"not an id of this project's protocol, which skips {FRAME_SKIP} frames itself; "
+            f"use {spec.name}, or {spec.id} for sticky actions"
+        )
+    return spec.kwargs["game"], 0.0
+
+
+def is_atari(spec: EnvSpec) -> bool:
+    return spec.entry_point == "ale_py.env:AtariEnv"
+
+
+def atari_specs() -> dict[str, EnvSpec]:
+    """Returns the games that ale-py registers (`ALE/…-v5`), keyed by name in lower case without underscores.
+
+    Four of its ROMs are for two players and are not registered; `AtariVectorEnv` kills the process on those.
+    """
+    return {spec.name.lower(): spec for spec in gym.registry.values() if spec.namespace == "ALE"}
+
+
+def make_gymnasium_envs(env_id: str, num_envs: int) -> VectorEnv:
+    """Builds `make_envs`'s vector environment for an id that is not Atari. Raises ValueError as `make_envs` does."""
+    try:
+        if not re.fullmatch(r"(\w+(\.\w+)*:)?[^:]+", env_id):
+            raise gym.error.UnregisteredEnv
+        envs = gym.make_vec(
+            env_id,
+            num_envs,
+            vectorization_mode="sync",
+            vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+            wrappers=[preprocess],
+        )
+    except gym.error.UnregisteredEnv as error:
+        names = [spec.name for spec in atari_specs().values()]
+        names += [spec.id for spec in gym.registry.values() if spec.namespace is None and not is_atari(spec)]
+        by_lower = {name.lower(): name for name in names}
+        close = [by_lower[name] for name in difflib.get_close_matches(env_id.lower(), by_lower, n=3)]
+        hint = f"did you mean {' or '.join(close)}?" if close else "use a game such as Breakout, or CartPole-v1"
+        raise ValueError(f"unknown environment; {hint}") from error
+    except (gym.error.Error, ImportError) as error:
+        raise ValueError(f"it cannot be built: {' '.join(str(error).split())}") from error
+    return RecordEpisodeStatistics(envs)
+
+
+def preprocess(env: gym.Env) -> gym.Env:
+    """Turns flat observations into float32 (D,) and images into stacked grey screens, uint8 (4, 84, 84).
+
+    Raises:
+        ValueError: the observations are neither, or the actions are not `Discrete`.
+    """
+    obs_space, action_space = env.observation_space, env.action_space
+    if not isinstance(action_space, Discrete):
+        raise ValueError(f"its actions are {action_space}; only Discrete actions are supported")
+    if action_space.start != 0:  # the scripts count actions from 0
+        start = int(action_space.start)
+        env = TransformAction(env, lambda action: action + start, Discrete(action_space.n))
+
+    shape = obs_space.shape if isinstance(obs_space, Box) else ()
+    if len(shape) == 1 and shape[0] > 0:
+        return DtypeObservation(env, np.float32)
+    is_screen = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
+    if not (is_screen and obs_space.dtype == np.uint8):
+        raise ValueError(
+            f"its observations are {obs_space}; only flat Box observations and uint8 images "
+            "of shape (height, width[, 1 or 3]) are supported"
+        )
+    if len(shape) == 3:
+        env = GrayscaleObservation(env) if shape[-1] == 3 else ReshapeObservation(env, shape[:2])
+    env = ResizeObservation(env, SCREEN)  # before the stack: one screen is resized, not four
+    return FrameStackObservation(env, STACK)

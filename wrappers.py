@@ -48,7 +48,7 @@ def make_envs(env_id: str, num_envs: int, num_threads: int = 0, max_frames: int 
             Gymnasium id, `module:Env-v0` included.
         num_envs: the number of copies N.
         num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
-        max_frames: emulator frames after which an Atari game is truncated, its no-ops at the start included.
+        max_frames: emulator frames after which an Atari game is truncated, counted from the end of its no-ops.
 
     Returns:
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,

@@ -1,0 +1,157 @@
+"""The pure functions of the scripts, against brute force, closed forms and numbers worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+import acppo_atari
+import ppo_atari
+
+
+def brute_force_gae(rewards, values, next_values, terminations, truncations, gamma, gae_lambda):
+    """The sum of section 2.5, Â_t = Σ_l (γλ)^l δ_{t+l}, cut after the step that ends an episode."""
+    num_steps, num_envs = rewards.shape
+    advantages = np.zeros((num_steps, num_envs))
+    for n in range(num_envs):
+        for t in range(num_steps):
+            for k in range(t, num_steps):
+                bootstrap = 0.0 if terminations[k, n] else gamma * next_values[k, n]
+                delta = rewards[k, n] + bootstrap - values[k, n]
+                advantages[t, n] += (gamma * gae_lambda) ** (k - t) * delta
+                if terminations[k, n] or truncations[k, n]:
+                    break
+    return advantages
+
+
+def test_gae_matches_the_brute_force_sum(script):
+    random = np.random.default_rng(1)
+    shape = (20, 6)
+    rewards, values, next_values = random.normal(size=(3, *shape))
+    terminations, truncations = random.random((2, *shape)) < 0.15
+    assert terminations.any() and truncations.any()
+    arrays = rewards, values, next_values, terminations, truncations
+    computed = script.compute_gae(*map(torch.from_numpy, arrays), gamma=0.9, gae_lambda=0.8)
+    assert np.allclose(computed, brute_force_gae(*arrays, gamma=0.9, gae_lambda=0.8), atol=1e-12)
+
+
+def constant_rollout(reward: float, value: float, num_steps: int):
+    never = torch.zeros(num_steps, 1, dtype=torch.bool)
+    full = torch.full((num_steps, 1), 1.0, dtype=torch.float64)
+    return reward * full, value * full, value * full, never, never
+
+
+def test_gae_of_reward_one_and_value_zero_is_a_geometric_sum(script):
+    gamma, gae_lambda, num_steps = 0.99, 0.95, 50
+    advantages = script.compute_gae(*constant_rollout(1.0, 0.0, num_steps), gamma, gae_lambda)
+    for steps_left in range(1, num_steps + 1):
+        expected = (1 - (gamma * gae_lambda) ** steps_left) / (1 - gamma * gae_lambda)
+        assert advantages[num_steps - steps_left].item() == pytest.approx(expected)
+
+
+def test_gae_of_the_true_value_is_zero(script):
+    advantages = script.compute_gae(*constant_rollout(1.0, 1 / (1 - 0.9), 50), 0.9, 0.95)
+    assert advantages.abs().max() < 1e-12
+
+
+def test_the_clip_range_of_ppo_is_epsilon_whatever_the_advantage():
+    assert ppo_atari.clip_range(torch.tensor([-3.0, 0.0, 2.0]), 0.1).tolist() == pytest.approx([0.1] * 3)
+
+
+def test_the_clip_range_of_acppo_follows_the_formula():
+    advantages = torch.tensor([-3.0, 0.0, 1.0, 0.5])
+    clip = acppo_atari.clip_range(advantages, 0.16, 2.0)
+    assert clip.tolist() == pytest.approx([0.16 / 7, 0.16, 0.16 / 3, 0.08])
+
+
+def test_the_clip_range_at_c_zero_is_ppos_to_the_bit():
+    advantages = torch.randn(1000, generator=torch.Generator().manual_seed(1))
+    for epsilon in (0.1, 0.16, 0.2):
+        assert torch.equal(acppo_atari.clip_range(advantages, epsilon, 0.0), ppo_atari.clip_range(advantages, epsilon))
+
+
+def test_the_clip_range_at_c_infinite_is_delta_over_the_advantage():
+    advantages = torch.tensor([-4.0, 0.5, 0.0])
+    assert acppo_atari.clip_range(advantages, 0.2, math.inf).tolist() == pytest.approx([0.05, 0.4, math.inf])
+
+
+@pytest.mark.parametrize("c", [0.0, 1.0, math.inf])
+def test_no_gradient_flows_through_the_clip_range(c):
+    advantages = torch.tensor([1.0, -2.0], requires_grad=True)
+    assert not acppo_atari.clip_range(advantages, 0.1, c).requires_grad
+
+
+def samples(count: int = 4000):
+    """Ratios on both sides of 1 and advantages of both signs, some of them 0."""
+    generator = torch.Generator().manual_seed(3)
+    logratio = 0.5 * torch.randn(count, generator=generator, dtype=torch.float64)
+    advantages = torch.randn(count, generator=generator, dtype=torch.float64)
+    advantages[:10] = 0.0
+    return logratio.exp().requires_grad_(), advantages
+
+
+def value_and_gradient(objective, ratio):
+    return objective.detach(), torch.autograd.grad(objective.sum(), ratio)[0]
+
+
+def test_at_c_infinite_the_objective_is_the_product_only_one_of_the_thesis():
+    """L^× of section 3.1 plus Â, which has mean 0 and no gradient: value and gradient, sample by sample."""
+    ratio, advantages = samples()
+    delta = 0.15
+    clip = acppo_atari.clip_range(advantages, delta, math.inf)
+    value, gradient = value_and_gradient(acppo_atari.surrogate(ratio, advantages, clip), ratio)
+    product = (ratio - 1) * advantages
+    expected = product.clamp(max=delta) + advantages
+    expected_value, expected_gradient = value_and_gradient(expected, ratio)
+    assert (product > delta).any() and (product < -delta).any()
+    assert torch.allclose(value, expected_value, atol=1e-12)
+    assert torch.allclose(gradient, expected_gradient, atol=1e-12)
+
+
+def test_a_large_c_with_epsilon_c_delta_approaches_the_product_only_objective():
+    ratio, advantages = samples()
+    delta, c = 0.15, 1e6
+    at_infinity = acppo_atari.surrogate(ratio, advantages, acppo_atari.clip_range(advantages, delta, math.inf))
+    nearby = acppo_atari.surrogate(ratio, advantages, acppo_atari.clip_range(advantages, c * delta, c))
+    assert torch.allclose(nearby, at_infinity, atol=1e-3)
+
+
+def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(script):
+    ratio = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.05])
+    advantages = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0])
+    clip = torch.full((5,), 0.1)
+    expected = [1.1 * 2, 0.5 * 2, 1.5 * -2, 0.9 * -2, 1.05 * 2]
+    assert script.surrogate(ratio, advantages, clip).tolist() == pytest.approx(expected)
+
+
+def test_the_value_loss_is_half_the_squared_error_and_the_larger_of_two_when_clipped(script):
+    new_values, values, returns = torch.tensor([1.0, 1.0]), torch.tensor([0.0, 0.0]), torch.tensor([3.0, 0.0])
+    assert script.value_loss(new_values, values, returns, None).item() == pytest.approx(0.5 * (4 + 1) / 2)
+    # Clipped to 0.1: errors 2.9² and 0.1², of which the larger with 2² and 1² counts
+    assert script.value_loss(new_values, values, returns, 0.1).item() == pytest.approx(0.5 * (2.9**2 + 1) / 2)
+
+
+def test_normalised_advantages_have_mean_zero_and_deviation_one(script):
+    normalised = script.normalize(torch.tensor([1.0, 2.0, 3.0, 6.0]))
+    assert normalised.mean().item() == pytest.approx(0, abs=1e-6)
+    assert normalised.std().item() == pytest.approx(1)
+
+
+def test_the_change_of_the_policy_on_two_states_worked_out_by_hand(script):
+    before = torch.tensor([[0.5, 0.5], [0.8, 0.2]], dtype=torch.float64)
+    after = torch.tensor([[0.6, 0.4], [0.5, 0.5]], dtype=torch.float64)
+    actions, advantages = torch.tensor([0, 1]), torch.tensor([2.0, -3.0], dtype=torch.float64)
+    change = script.policy_change(before.log(), after.log(), actions, advantages)
+    log = math.log
+    kl_first = 0.5 * log(0.5 / 0.6) + 0.5 * log(0.5 / 0.4)
+    kl_second = 0.8 * log(0.8 / 0.5) + 0.2 * log(0.2 / 0.5)
+    expected = {
+        "kl": (kl_first + kl_second) / 2,
+        "old_approx_kl": (log(0.5 / 0.6) + log(0.2 / 0.5)) / 2,
+        "approx_kl": ((0.2 - log(1.2)) + (1.5 - log(2.5))) / 2,
+        "tv_distance": (0.1 + 0.3) / 2,
+        "max_tv_distance": 0.3,
+        "max_ratio_advantage": 4.5,  # |(2.5 - 1) · (-3)|
+    }
+    assert {name: value.item() for name, value in change.items()} == pytest.approx(expected)

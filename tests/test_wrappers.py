@@ -1,0 +1,234 @@
+"""The environments: real games step by step against a reference, names, seeds, and what is refused."""
+
+import ale_py
+import cv2
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.spaces import Box, Discrete
+
+import tiny_envs  # noqa: F401  (registers its environments)
+from wrappers import atari_specs, env_seeds, find_atari_game, make_envs
+
+
+class ReferenceGame:
+    """One game of the thesis's protocol, frame by frame on `ALEInterface`, written from the protocol's description."""
+
+    def __init__(self, rom: str, seed: int, max_frames: int = 108_000):
+        self.ale = ale_py.ALEInterface()
+        self.ale.setLoggerMode(ale_py.LoggerMode.Error)
+        self.ale.setInt("random_seed", seed)
+        self.ale.setFloat("repeat_action_probability", 0.0)
+        self.ale.loadROM(ale_py.roms.get_rom_path(rom))
+        self.actions = self.ale.getMinimalActionSet()
+        self.max_frames = max_frames
+
+    def reset(self, frames: int) -> None:
+        """Starts a game with no-ops up to a frame number: how many there are, ale-py's own random generator draws."""
+        self.ale.reset_game()
+        while self.ale.getEpisodeFrameNumber() < frames:
+            self.ale.act(ale_py.Action.NOOP)
+        self.score, self.frames, self.steps = 0, 0, 0  # ale-py counts the frames of its limit after the no-ops
+        self.life_starts = True
+        blank = np.zeros((84, 84), np.uint8)
+        self.stack = [blank, blank, blank, self.shrink(self.ale.getScreenGrayscale())]
+
+    def step(self, action: int) -> None:
+        """Plays one agent step and leaves reward, life_lost, over, truncated and the stack of screens behind."""
+        pressed = self.actions[action]
+        if self.life_starts and ale_py.Action.FIRE in self.actions:
+            pressed = ale_py.Action.FIRE
+        lives_before, self.reward, screens = self.ale.lives(), 0, []
+        for _ in range(4):
+            self.reward += self.ale.act(pressed)
+            screens.append(self.ale.getScreenGrayscale())
+            self.frames += 1
+            if self.ale.game_over():
+                break
+        self.score += self.reward
+        self.steps += 1
+        self.over = self.ale.game_over()
+        self.truncated = not self.over and self.frames >= self.max_frames
+        if self.truncated:  # ale-py stops before it sees the last frame, as Gymnasium's AtariPreprocessing does
+            screens = [self.pooled, screens[2]]
+        self.pooled = np.maximum(*(screens * 2)[-2:])
+        self.stack = [*self.stack[1:], self.shrink(self.pooled)]
+        self.life_lost = not self.over and not self.truncated and 0 < self.ale.lives() < lives_before
+        self.life_starts = self.life_lost
+
+    @staticmethod
+    def shrink(screen: np.ndarray) -> np.ndarray:
+        return cv2.resize(screen, (84, 84), interpolation=cv2.INTER_AREA)
+
+
+@pytest.mark.parametrize(
+    ("rom", "num_steps", "expect"),
+    [
+        ("breakout", 700, {"game", "life"}),  # lives and FIRE
+        ("pong", 1000, {"game"}),  # no lives
+        ("frogger", 700, {"game", "life", "waits at 0 lives"}),
+        ("double_dunk", 300, set()),  # no lives, long games
+        ("breakout", 300, {"game", "life", "truncation"}),
+    ],
+)
+def test_games_match_a_frame_by_frame_reference(rom, num_steps, expect):
+    num_envs, random = 2, np.random.default_rng(7)
+    max_frames = 400 if "truncation" in expect else 108_000
+    envs = make_envs(rom, num_envs, max_frames=max_frames)
+    seeds = env_seeds(3, num_envs)
+    obs, infos = envs.reset(seed=seeds)
+    games = [ReferenceGame(rom, seed, max_frames) for seed in seeds]
+    for game, frames in zip(games, infos["episode_frame_number"]):
+        game.reset(frames)
+    assert np.array_equal(obs, [game.stack for game in games])
+
+    seen = set()
+    for _ in range(num_steps):
+        actions = random.integers(0, envs.single_action_space.n, num_envs)
+        obs, rewards, terminations, truncations, infos = envs.step(actions)
+        for i, game in enumerate(games):
+            game.step(actions[i])
+            assert rewards[i] == np.sign(game.reward)
+            assert terminations[i] == (game.over or game.life_lost)
+            assert truncations[i] == game.truncated
+            assert infos.get("_episode", np.zeros(num_envs, bool))[i] == (game.over or game.truncated)
+            if game.truncated:
+                assert np.array_equal(infos["final_obs"][i], game.stack)
+                seen.add("truncation")
+            if game.life_lost:
+                seen.add("life")
+            if not game.over and not game.truncated and game.ale.lives() == 0:
+                seen.add("waits at 0 lives")
+            if game.over or game.truncated:
+                assert infos["episode"]["r"][i] == game.score
+                assert infos["episode"]["l"][i] == game.steps
+                seen.add("game")
+                game.reset(infos["episode_frame_number"][i])
+            assert infos["lives"][i] == game.ale.lives()
+            assert np.array_equal(obs[i], game.stack)
+    assert expect <= seen
+
+
+def test_breakout_counts_five_lives_down_and_gives_one_score_a_game():
+    envs = make_envs("Breakout", 1)
+    _, infos = envs.reset(seed=env_seeds(1, 1))
+    lives, life_ends, scores = [int(infos["lives"][0])], 0, []
+    while not scores:
+        _, _, terminations, _, infos = envs.step(np.array([0]))
+        life_ends += int(terminations[0])
+        if "episode" in infos:
+            scores += list(infos["episode"]["r"])
+        elif infos["lives"][0] != lives[-1]:
+            lives.append(int(infos["lives"][0]))
+    assert lives == [5, 4, 3, 2, 1]
+    assert life_ends == 5  # four lost lives and the end of the game
+    assert len(scores) == 1
+
+
+def test_a_policy_that_only_says_noop_does_not_stall_in_breakout():
+    envs = make_envs("Breakout", 4)
+    envs.reset(seed=env_seeds(1, 4))
+    games = sum("episode" in envs.step(np.zeros(4, int))[-1] for _ in range(600))
+    assert games >= 4
+
+
+def test_sticky_actions_belong_to_the_ale_id_alone():
+    assert find_atari_game("ALE/Breakout-v5") == ("breakout", 0.25)
+    for name in ("Breakout", "breakout", "BreakoutNoFrameskip-v4"):
+        assert find_atari_game(name) == ("breakout", 0.0)
+    for name in ("NameThisGame", "name_this_game"):
+        assert find_atari_game(name) == ("name_this_game", 0.0)
+    assert find_atari_game("Blackjack-v1") is None  # Gymnasium's own, not Atari's game of that name
+
+
+def test_every_registered_game_is_found_by_its_bare_name():
+    specs = atari_specs().values()
+    assert len(specs) == 104
+    for spec in specs:
+        assert find_atari_game(spec.name) == find_atari_game(spec.kwargs["game"]) == (spec.kwargs["game"], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "message"),
+    [
+        ("Brekout", "did you mean Breakout"),
+        ("CartPole-v9", "did you mean CartPole-v1"),
+        ("combat", "no mode for one player"),
+        ("MazeCraze", "no mode for one player"),
+        ("Breakout-v4", "use Breakout, or ALE/Breakout-v5"),
+        ("BreakoutDeterministic-v4", "use Breakout, or ALE/Breakout-v5"),
+        ("BreakoutNoFrameskip-v0", "use Breakout, or ALE/Breakout-v5"),
+        ("Pendulum-v1", "only Discrete actions"),
+        ("FrozenLake-v1", "only flat Box observations and uint8 images"),
+        ("Blackjack-v1", "only flat Box observations and uint8 images"),
+        ("no_such_module:Env-v0", "No module named 'no_such_module'"),
+        ("a:b:c", "unknown environment"),
+        ("", "unknown environment"),
+    ],
+)
+def test_what_cannot_be_played_is_refused_by_name(env_id, message):
+    with pytest.raises(ValueError, match=message) as refusal:
+        make_envs(env_id, 2)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("env_id", ["tiny_envs:TinyPixels-v0", "TinyPixelsGrey-v0", "TinyPixelsOneChannel-v0"])
+def test_other_images_become_stacked_grey_screens(env_id):
+    envs = make_envs(env_id, 3)
+    obs, _ = envs.reset(seed=env_seeds(1, 3))
+    assert obs.shape == (3, 4, 84, 84) and obs.dtype == np.uint8
+    columns = [env.unwrapped.column for env in envs.unwrapped.envs]
+    brightest = obs[:, -1].mean(axis=1).argmax(axis=1)  # (N, 84) → the bright column of the newest screen
+    assert np.allclose(brightest * 16 / 84, columns, atol=1)
+    moved, *_ = envs.step(np.ones(3, int))
+    assert np.array_equal(moved[:, :3], obs[:, 1:])  # the oldest screen leaves, the others move up
+
+
+def test_flat_observations_become_float32_and_rewards_stay():
+    envs = make_envs("CartPole-v1", 2)
+    obs, _ = envs.reset(seed=env_seeds(1, 2))
+    assert obs.dtype == np.float32 and obs.shape == (2, 4)
+    assert make_envs("MountainCar-v0", 1).single_observation_space.dtype == np.float32
+    acrobot = make_envs("Acrobot-v1", 1)
+    acrobot.reset(seed=[1])
+    assert acrobot.step(np.array([0]))[1] == [-1.0]
+
+
+class CountsFromFive(gym.Env):
+    """Its actions are 5 and 6; anything else is an error."""
+
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2, start=5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert action in self.action_space
+        return np.zeros(1, np.float32), float(action), False, False, {}
+
+
+def test_actions_that_start_elsewhere_are_counted_from_zero():
+    gym.register("CountsFromFive-v0", CountsFromFive)
+    envs = make_envs("CountsFromFive-v0", 2)
+    assert envs.single_action_space == Discrete(2)
+    envs.reset(seed=[1, 2])
+    assert list(envs.step(np.array([0, 1]))[1]) == [5.0, 6.0]
+
+
+def test_games_reset_in_the_step_that_ends_them():
+    envs = make_envs("CartPole-v1", 1)
+    obs, _ = envs.reset(seed=[5])
+    while True:
+        obs, _, terminations, _, infos = envs.step(np.array([1]))
+        if terminations[0]:
+            break
+    assert abs(obs[0, 2]) < 0.06  # the new pole stands upright …
+    assert abs(infos["final_obs"][0][2]) > 0.2  # … the old one had fallen
+
+
+def test_runs_with_neighbouring_seeds_share_no_environment_seed():
+    seeds = [number for seed in range(50) for number in env_seeds(seed, 8)]
+    assert len(set(seeds)) == len(seeds)
+    assert all(type(number) is int and 0 <= number < 2**31 for number in seeds)
+    assert env_seeds(1, 8) == env_seeds(1, 8)

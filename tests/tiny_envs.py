@@ -1,0 +1,39 @@
+"""Environments small enough for tests, registered when this module is imported."""
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Discrete
+
+
+class TinyPixels(gym.Env):
+    """A bright column moves left or right; the left edge pays and ends the episode.
+
+    Actions: 0 left, 1 right. Reward: 1 at the left edge. `max_episode_steps` truncates.
+    """
+
+    action_space = Discrete(2)
+
+    def __init__(self, channels: int | None = 3):
+        shape = (12, 16) if channels is None else (12, 16, channels)
+        self.observation_space = Box(0, 255, shape, np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.column = int(self.np_random.integers(4, 12))
+        return self.screen(), {}
+
+    def step(self, action):
+        self.column = min(15, self.column + (1 if action == 1 else -1))
+        reached = self.column == 0
+        return self.screen(), float(reached), reached, False, {}
+
+    def screen(self):
+        screen = np.zeros(self.observation_space.shape, np.uint8)
+        screen[:, self.column] = 255
+        return screen
+
+
+gym.register("TinyPixels-v0", TinyPixels, max_episode_steps=20)
+gym.register("TinyPixelsGrey-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": None})
+gym.register("TinyPixelsOneChannel-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": 1})
+gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)

@@ -13,6 +13,7 @@ PPO then trains on.
 
 import difflib
 import re
+import warnings
 from collections.abc import Sequence
 
 import ale_py
@@ -74,25 +75,28 @@ def make_envs(env_id: str, num_envs: int, num_threads: int = 0, max_frames: int 
         img_width=SCREEN[1],
         stack_num=STACK,
         autoreset_mode=AutoresetMode.SAME_STEP,
-        # These four would each hide something: the rest of a game whose first life is lost, the unclipped score,
-        # and FIRE after a lost life. EpisodicLife and TransformReward below do them, in the right order.
-        episodic_life=False,
-        life_loss_info=False,
-        reward_clipping=False,
-        use_fire_reset=False,
+        maxpool=True,  # over the last two frames: sprites flicker
+        noop_max=30,  # 0 to 29 of them
+        full_action_space=False,
+        episodic_life=False,  # would reset the whole game at a lost life: later lives are never seen
+        life_loss_info=False,  # would report it, but as the end of a game to the statistics below as well
+        reward_clipping=False,  # would hide the score
+        use_fire_reset=False,  # would press FIRE before the no-ops, and never after a lost life
     )
     envs = RecordEpisodeStatistics(envs)  # above EpisodicLife it would count lives, above the sign clipped rewards
     envs = EpisodicLife(envs)
     return TransformReward(envs, np.sign)
 
 
-def env_seeds(seed: int, num_envs: int) -> list[int]:
+def env_seeds(seed: int, num_envs: int, starts: int = 0) -> list[int]:
     """Returns a seed for each environment, drawn from one `SeedSequence`: runs with neighbouring seeds share none.
 
+    A run that has been started `starts` times before gets the next numbers of its sequence, for new games.
     Gymnasium's own rule, seed, seed + 1, …, gives run 2 seven of the eight environments of run 1. 31 bits, because
     ale-py refuses larger ones.
     """
-    return [int(number) for number in np.random.SeedSequence(seed).generate_state(num_envs) >> 1]
+    numbers = np.random.SeedSequence(seed).generate_state(num_envs * (starts + 1)) >> 1
+    return [int(number) for number in numbers[-num_envs:]]
 
 
 class EpisodicLife(VectorWrapper):
@@ -172,15 +176,18 @@ def atari_specs() -> dict[str, EnvSpec]:
 def make_gymnasium_envs(env_id: str, num_envs: int) -> VectorEnv:
     """Builds `make_envs`'s vector environment for an id that is not Atari. Raises ValueError as `make_envs` does."""
     try:
-        if not re.fullmatch(r"(\w+(\.\w+)*:)?[^:]+", env_id):
+        if not re.fullmatch(r"(\w+(\.\w+)*:)?[\w/.-]+", env_id):
             raise gym.error.UnregisteredEnv
-        envs = gym.make_vec(
-            env_id,
-            num_envs,
-            vectorization_mode="sync",
-            vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
-            wrappers=[preprocess],
-        )
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # "out of date": the id was chosen, or is refused below in one line
+            envs = gym.make_vec(
+                env_id,
+                num_envs,
+                vectorization_mode="sync",
+                vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
+                wrappers=[preprocess],
+            )
+            envs.reset()  # an environment that cannot start is refused here, too
     except gym.error.UnregisteredEnv as error:
         names = [spec.name for spec in atari_specs().values()]
         names += [spec.id for spec in gym.registry.values() if spec.namespace is None and not is_atari(spec)]
@@ -188,20 +195,26 @@ def make_gymnasium_envs(env_id: str, num_envs: int) -> VectorEnv:
         close = [by_lower[name] for name in difflib.get_close_matches(env_id.lower(), by_lower, n=3)]
         hint = f"did you mean {' or '.join(close)}?" if close else "use a game such as Breakout, or CartPole-v1"
         raise ValueError(f"unknown environment; {hint}") from error
-    except (gym.error.Error, ImportError) as error:
-        raise ValueError(f"it cannot be built: {' '.join(str(error).split())}") from error
+    except UnsupportedSpace:
+        raise
+    except Exception as error:  # whatever a foreign constructor raises
+        raise ValueError(f"it cannot be built: {error or type(error).__name__}") from error
     return RecordEpisodeStatistics(envs)
+
+
+class UnsupportedSpace(ValueError):
+    """Observations or actions that the scripts have no network for."""
 
 
 def preprocess(env: gym.Env) -> gym.Env:
     """Turns flat observations into float32 (D,) and images into stacked grey screens, uint8 (4, 84, 84).
 
     Raises:
-        ValueError: the observations are neither, or the actions are not `Discrete`.
+        UnsupportedSpace: the observations are neither, or the actions are not `Discrete`.
     """
     obs_space, action_space = env.observation_space, env.action_space
     if not isinstance(action_space, Discrete):
-        raise ValueError(f"its actions are {action_space}; only Discrete actions are supported")
+        raise UnsupportedSpace(f"its actions are {action_space}; only Discrete actions are supported")
     if action_space.start != 0:  # the scripts count actions from 0
         start = int(action_space.start)
         env = TransformAction(env, lambda action: action + start, Discrete(action_space.n))
@@ -211,7 +224,7 @@ def preprocess(env: gym.Env) -> gym.Env:
         return DtypeObservation(env, np.float32)
     is_screen = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
     if not (is_screen and obs_space.dtype == np.uint8):
-        raise ValueError(
+        raise UnsupportedSpace(
             f"its observations are {obs_space}; only flat Box observations and uint8 images "
             "of shape (height, width[, 1 or 3]) are supported"
         )

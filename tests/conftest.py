@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,7 @@ def train(script, run_dir, **arguments) -> dict[str, list[tuple[int, float]]]:
     args = script.Args(**{"threads": 1, **arguments})
     run_dir = Path(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
-    script.train(args, make_envs(args.env_id, args.num_envs, args.threads), str(run_dir))
+    script.train(args, make_envs(args.env_id, args.num_envs, args.threads), script.RunDirectory(str(run_dir)))
     return scalars(run_dir)
 
 
@@ -51,3 +52,17 @@ def run_script(script, *flags: str, cwd: Path) -> subprocess.CompletedProcess:
     environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests"), "COLUMNS": "200"}
     command = [sys.executable, script.__file__, *flags]
     return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture
+def call_main(monkeypatch, capsys):
+    """Calls a script's `main` in this process, for what ends before it trains: (exit status, stdout, stderr)."""
+
+    def call(script, *flags: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", [script.__file__, *flags])
+        monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # which main replaces
+        with pytest.raises(SystemExit) as ended:
+            script.main()
+        return ended.value.code, *capsys.readouterr()
+
+    return call

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import acppo_atari
 from conftest import ROOT, SHORT_CARTPOLE, TINY_PIXELS, run_script, scalars
-
-SMALL = ("--num-envs", "4", "--num-steps", "64", "--total-timesteps", "512")
 
 
 def documented_tags() -> set[str]:
@@ -23,7 +22,16 @@ def documented_tags() -> set[str]:
 def test_a_run_logs_every_documented_tag_with_finite_values(script, env_id, tmp_path):
     num_steps = "128" if env_id == "Breakout" else "64"  # long enough for a game of Breakout to end
     run = run_script(
-        script, "--env-id", env_id, *SMALL, "--num-steps", num_steps, "--total-timesteps", "1024", cwd=tmp_path
+        script,
+        "--env-id",
+        env_id,
+        "--num-envs",
+        "4",
+        "--num-steps",
+        num_steps,
+        "--total-timesteps",
+        "1024",
+        cwd=tmp_path,
     )
     assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
     (run_dir,) = (tmp_path / "runs").iterdir()
@@ -67,12 +75,19 @@ REFUSED = [
     (["--env-id", "Pendulum-v1"], "--env-id Pendulum-v1", "only Discrete actions"),
     (["--env-id", "FrozenLake-v1"], "--env-id FrozenLake-v1", "only flat Box observations"),
     (["--total-timesteps", "1023"], "--total-timesteps 1023", "at least one rollout, num_envs · num_steps = 1024"),
-    (["--num-minibatches", "3"], "--num-minibatches 3", "a divisor of a rollout's 1024 samples"),
+    (["--num-minibatches", "3"], "--num-minibatches 3", "a divisor of num_envs · num_steps = 1024"),
     (["--num-minibatches", "2048"], "--num-minibatches 2048", "a divisor"),
     (["--num-minibatches", "1024"], "--num-minibatches 1024", "one sample cannot be normalised"),
     (["--clip-coef", "0"], "--clip-coef 0.0", "above 0"),
     (["--clip-coef", "nan"], "--clip-coef nan", "above 0"),
     (["--clip-coef", "inf"], "--clip-coef inf", "finite"),
+    (["--vf-clip-coef", "1e39"], "--vf-clip-coef 1e+39", "finite"),
+    (["--num-steps", "1000000000"], "--num-steps 1000000000", "at most 1,000,000 samples"),
+    (["--threads", "100000"], "--threads 100000", "a number from 1 to"),
+    (["--exp-name", "a" * 300], "--exp-name " + "a" * 300, "up to 100"),
+    (["--env-id", "Brek\nout"], "--env-id Brek out", "unknown environment"),
+    (["--env-id", "Break out"], "--env-id Break out", "did you mean Breakout"),
+    (["--env-id", "HalfCheetah-v4"], "--env-id HalfCheetah-v4", "cannot be built"),
     (["--vf-clip-coef", "-0.1"], "--vf-clip-coef -0.1", "above 0"),
     (["--learning-rate", "0"], "--learning-rate 0.0", "above 0"),
     (["--learning-rate", "inf"], "--learning-rate inf", "finite"),
@@ -80,7 +95,7 @@ REFUSED = [
     (["--num-envs", "0"], "--num-envs 0", "above 0"),
     (["--num-steps", "-1"], "--num-steps -1", "above 0"),
     (["--update-epochs", "0"], "--update-epochs 0", "above 0"),
-    (["--threads", "0"], "--threads 0", "above 0"),
+    (["--threads", "0"], "--threads 0", "a number from 1 to"),
     (["--ent-coef", "-1"], "--ent-coef -1.0", "0 or above"),
     (["--vf-coef", "nan"], "--vf-coef nan", "0 or above"),
     (["--gamma", "1.01"], "--gamma 1.01", "from 0 to 1"),
@@ -94,32 +109,29 @@ REFUSED = [
 ]
 
 
-def refusal(script, flags, tmp_path, monkeypatch, capsys) -> str:
-    """Runs the script's `main` in this process and returns the one line it ends with."""
+def check_refusal(outcome: tuple, directory: Path, named: str, said: str) -> None:
+    status, out, err = outcome
+    assert (status, out) == (2, "") and err.count("\n") == 1
+    assert err.startswith(f"{named}: ") and said in err
+    assert [path.name for path in directory.iterdir()] == ["taken"]
+
+
+@pytest.fixture
+def directory(tmp_path, monkeypatch) -> Path:
+    """The working directory of a call, empty but for a file where a log directory might be wanted."""
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "taken").write_text("a file where the log directory should be")
-    monkeypatch.setattr(sys, "argv", [script.__file__, *flags])
-    with pytest.raises(SystemExit) as exit_:
-        script.main()
-    assert exit_.value.code == 2
-    assert [path.name for path in tmp_path.iterdir()] == ["taken"]
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1
-    return err
+    (tmp_path / "taken").write_text("a file")
+    return tmp_path
 
 
 @pytest.mark.parametrize(("flags", "named", "said"), REFUSED, ids=[" ".join(flags) for flags, _, _ in REFUSED])
-def test_bad_input_is_refused_in_one_line_and_leaves_nothing(script, flags, named, said, tmp_path, monkeypatch, capsys):
-    line = refusal(script, flags, tmp_path, monkeypatch, capsys)
-    assert line.startswith(f"{named}: ") and said in line
+def test_bad_input_is_refused_in_one_line_and_leaves_nothing(script, flags, named, said, directory, call_main):
+    check_refusal(call_main(script, *flags), directory, named, said)
 
 
-@pytest.mark.parametrize("c", ["-1", "nan", "-inf"])
-def test_a_weight_c_that_is_no_weight_is_refused(c, tmp_path, monkeypatch, capsys):
-    import acppo_atari
-
-    line = refusal(acppo_atari, ["--c", c], tmp_path, monkeypatch, capsys)
-    assert line.startswith(f"--c {float(c)}: ") and "0 or above" in line
+@pytest.mark.parametrize("c", ["-1", "nan", "-inf", "1e39"])
+def test_a_weight_c_that_is_no_weight_is_refused(c, directory, call_main):
+    check_refusal(call_main(acppo_atari, "--c", c), directory, f"--c {float(c)}", "0 or above")
 
 
 def test_a_refusal_is_status_two_and_one_line_from_the_process_too(script, tmp_path):

@@ -1,8 +1,11 @@
 """Whole trainings in this process: what must be equal, what must be zero, and every logged number worked out again."""
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch
+from gymnasium.spaces import Box, Discrete
+from torch.optim.optimizer import register_optimizer_step_pre_hook
 
 import acppo_atari
 import ppo_atari
@@ -116,7 +119,7 @@ def test_every_logged_metric_is_what_it_is_defined_to_be(script, arguments, tmp_
 
     rollout, gae = Recorder(monkeypatch, script, "act"), Recorder(monkeypatch, script, "compute_gae")
     objective, fit = Recorder(monkeypatch, script, "surrogate"), Recorder(monkeypatch, script, "value_loss")
-    after = script.train(args, envs, str(tmp_path))
+    after = script.train(args, envs, script.RunDirectory(str(tmp_path)))
     logged = {tag: points[0][1] for tag, points in scalars(tmp_path).items()}
 
     obs = torch.cat([given[1] for given, _ in rollout.calls])
@@ -153,6 +156,100 @@ def test_every_logged_metric_is_what_it_is_defined_to_be(script, arguments, tmp_
         assert logged[f"losses/{name}"] == pytest.approx(value, rel=1e-3, abs=1e-6), name
 
 
+def test_the_first_minibatch_is_fitted_to_the_rollout_itself(script, tmp_path, monkeypatch):
+    """One minibatch, one epoch: the ratios are 1 and the values the rollout's, so that the losses have closed forms."""
+    arguments = {**CARTPOLE, "total_timesteps": 128, "num_minibatches": 1, "update_epochs": 1, "norm_adv": False}
+    gae = Recorder(monkeypatch, script, "compute_gae")
+    torch.manual_seed(1)
+    before = script.Agent((4,), 2)
+    rollout = Recorder(monkeypatch, script, "act")
+    logged = train(script, tmp_path / "raw", **arguments)
+    advantages = gae.calls[0][1].numpy()
+    policy = log_softmax(before(torch.cat([given[1] for given, _ in rollout.calls]))[0])
+    assert abs(advantages.mean()) > 0.1
+    assert values(logged, "losses/policy_loss") == pytest.approx([-advantages.mean()], rel=1e-4)
+    assert values(logged, "losses/value_loss") == pytest.approx([0.5 * (advantages**2).mean()], rel=1e-4)
+    assert values(logged, "losses/entropy") == pytest.approx([-(np.exp(policy) * policy).sum(1).mean()], rel=1e-5)
+    normalised = train(script, tmp_path / "normalised", **{**arguments, "norm_adv": True})
+    assert values(normalised, "losses/policy_loss") == pytest.approx([0], abs=1e-5)
+
+
+def test_every_epoch_takes_every_sample_once_in_an_order_of_its_own(script, tmp_path, monkeypatch):
+    objective = Recorder(monkeypatch, script, "surrogate")
+    train(script, tmp_path, norm_adv=False, **{**CARTPOLE, "total_timesteps": 128})
+    epochs = torch.cat([given[1] for given, _ in objective.calls]).reshape(4, 128)
+    for epoch in epochs[1:]:
+        assert torch.equal(epoch.sort().values, epochs[0].sort().values)
+        assert not torch.equal(epoch, epochs[0])
+
+
+@pytest.mark.parametrize(("clip_vloss", "expected"), [(True, 0.3), (False, None)])
+def test_the_value_loss_is_clipped_unless_it_is_switched_off(script, clip_vloss, expected, tmp_path, monkeypatch):
+    fit = Recorder(monkeypatch, script, "value_loss")
+    train(script, tmp_path, clip_vloss=clip_vloss, vf_clip_coef=0.3, **CARTPOLE)
+    assert {given[3] for given, _ in fit.calls} == {expected}
+
+
+def test_the_gradients_norm_is_clipped(script, tmp_path):
+    norms = []
+
+    def keep_norm(optimizer, *_):
+        gradients = [parameter.grad.flatten() for group in optimizer.param_groups for parameter in group["params"]]
+        norms.append(torch.cat(gradients).norm().item())
+
+    hook = register_optimizer_step_pre_hook(keep_norm)
+    train(script, tmp_path, max_grad_norm=0.02, **CARTPOLE)
+    hook.remove()
+    assert len(norms) == 32 and norms == pytest.approx([0.02] * 32, rel=1e-3)
+
+
+def test_rewards_and_scores_are_those_of_the_environments(script, tmp_path, monkeypatch):
+    """The environments are played again with the recorded actions."""
+    args = script.Args(env_id=SHORT_CARTPOLE, num_envs=8, num_steps=64, total_timesteps=2048, threads=1)
+    rollout, gae = Recorder(monkeypatch, script, "act"), Recorder(monkeypatch, script, "compute_gae")
+    script.train(args, make_envs(SHORT_CARTPOLE, 8), script.RunDirectory(str(tmp_path)))
+    envs = make_envs(SHORT_CARTPOLE, 8)
+    envs.reset(seed=env_seeds(args.seed, 8))
+    rewards, scores, lengths = [], [], []
+    for t, (_, (actions, _, _)) in enumerate(rollout.calls, start=1):
+        _, reward, terminated, truncated, infos = envs.step(actions.numpy())
+        rewards.append(reward)
+        for n in np.flatnonzero(terminated | truncated):
+            scores.append((8 * t, infos["episode"]["r"][n]))
+            lengths.append((8 * t, infos["episode"]["l"][n]))
+    assert np.array_equal(np.concatenate([given[0] for given, _ in gae.calls]), rewards)
+    logged = scalars(tmp_path)
+    assert logged["charts/episodic_return"] == scores and logged["charts/episodic_length"] == lengths
+    assert len(scores) > 120
+    last_hundred = [np.mean([score for step, score in scores if step <= end][-100:]) for end in (512, 1024, 1536, 2048)]
+    assert values(logged, "charts/mean_return_100") == pytest.approx(last_hundred)
+
+
+def test_speed_and_phases_add_up_to_the_time_that_passed(script, tmp_path):
+    logged = train(script, tmp_path, **{**BREAKOUT, "total_timesteps": 128})
+    phases = sum(values(logged, tag)[0] for tag in logged if tag.startswith("time/"))
+    assert 0.8 < phases * values(logged, "charts/SPS")[0] / 128 < 1.2
+
+
+class RewardNothing(gym.Env):
+    """Every step ends an episode with no reward, so that all returns are 0."""
+
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, True, False, {}
+
+
+def test_the_variance_of_equal_returns_leaves_nothing_to_explain(script, tmp_path):
+    gym.register("RewardNothing-v0", RewardNothing)
+    logged = train(script, tmp_path, gae_lambda=0.0, **{**SMALL, "env_id": "RewardNothing-v0", "total_timesteps": 128})
+    assert np.isnan(values(logged, "losses/explained_variance")).all()
+
+
 def test_the_average_clip_ratio_counts_a_range_above_one_as_one(tmp_path):
     logged = train(acppo_atari, tmp_path, c=float("inf"), clip_coef=1e6, **CARTPOLE)
     assert values(logged, "losses/avg_clip_ratio") == pytest.approx([1.0, 1.0])
@@ -164,7 +261,7 @@ def test_a_truncation_bootstraps_from_the_observation_it_ended_on(script, env_id
     args = script.Args(threads=1, learning_rate=0.0, env_id=env_id, num_envs=4, num_steps=32, total_timesteps=128)
     rollout, gae = Recorder(monkeypatch, script, "act"), Recorder(monkeypatch, script, "compute_gae")
     envs = make_envs(env_id, args.num_envs, max_frames=100)
-    agent = script.train(args, envs, str(tmp_path))
+    agent = script.train(args, envs, script.RunDirectory(str(tmp_path)))
     next_values, terminations, truncations = gae.calls[0][0][2:5]
     assert 0 < truncations.sum() < truncations.numel() / 10
 

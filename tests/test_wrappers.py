@@ -67,7 +67,7 @@ class ReferenceGame:
         ("breakout", 700, {"game", "life"}),  # lives and FIRE
         ("pong", 1000, {"game"}),  # no lives
         ("frogger", 700, {"game", "life", "waits at 0 lives"}),
-        ("double_dunk", 300, set()),  # no lives, long games
+        ("double_dunk", 250, {"game", "truncation"}),  # no lives, and games too long to wait for their end
         ("breakout", 300, {"game", "life", "truncation"}),
     ],
 )
@@ -132,6 +132,28 @@ def test_a_policy_that_only_says_noop_does_not_stall_in_breakout():
     assert games >= 4
 
 
+def test_a_game_starts_with_0_to_29_noops():
+    envs = make_envs("Breakout", 8)
+    frames = np.concatenate([envs.reset(seed=env_seeds(seed, 8))[1]["episode_frame_number"] for seed in range(15)])
+    assert (frames.min(), frames.max()) == (0, 29)
+
+
+def test_sticky_actions_are_played_in_the_ale_id_alone():
+    """Without them two games from the same start that are played alike stay alike, whatever their random generators."""
+
+    def screens(env_id: str) -> np.ndarray:
+        envs = make_envs(env_id, 8)
+        _, infos = envs.reset(seed=env_seeds(4, 8))
+        starts = infos["episode_frame_number"]
+        first, second = next((i, j) for i in range(8) for j in range(i) if starts[i] == starts[j])
+        for action in [1, 2, 2, 3, 3, 2, 3, 2, 2, 3] * 3:
+            obs = envs.step(np.full(8, action))[0]
+        return obs[first], obs[second]
+
+    assert np.array_equal(*screens("Breakout"))
+    assert not np.array_equal(*screens("ALE/Breakout-v5"))
+
+
 def test_sticky_actions_belong_to_the_ale_id_alone():
     assert find_atari_game("ALE/Breakout-v5") == ("breakout", 0.25)
     for name in ("Breakout", "breakout", "BreakoutNoFrameskip-v4"):
@@ -192,6 +214,26 @@ def test_flat_observations_become_float32_and_rewards_stay():
     acrobot = make_envs("Acrobot-v1", 1)
     acrobot.reset(seed=[1])
     assert acrobot.step(np.array([0]))[1] == [-1.0]
+
+
+class CannotStart(gym.Env):
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
+
+    def __init__(self, fails_in: str):
+        self.fails_in = fails_in
+        if fails_in == "init":
+            raise RuntimeError("no such\nlevel")
+
+    def reset(self, *, seed=None, options=None):
+        raise FileNotFoundError("level.txt")
+
+
+@pytest.mark.parametrize(("fails_in", "message"), [("init", "no such\nlevel"), ("reset", "level.txt")])
+def test_an_environment_that_cannot_start_is_refused(fails_in, message):
+    gym.register("CannotStart-v0", CannotStart, kwargs={"fails_in": fails_in})
+    with pytest.raises(ValueError, match=f"it cannot be built: {message}"):
+        make_envs("CannotStart-v0", 2)
+    del gym.registry["CannotStart-v0"]
 
 
 class CountsFromFive(gym.Env):

@@ -1,0 +1,466 @@
+"""Agent steps per second of the training scripts, of other PPOs in the same call, and of the processor itself.
+
+    python benchmark/throughput.py ppo_atari.py acppo_atari.py
+    python benchmark/throughput.py ppo_atari.py "ppo_atari.py --bf16" --peer --cleanrl ../cleanrl
+    python benchmark/throughput.py ppo_atari.py --jobs 1 2
+    python benchmark/throughput.py ppo_atari.py --num-envs 8 16 32 64 --threads 1 2
+
+A contender is a script with its flags, in one string. Each run is a whole process on the processor alone, no GPU, and
+is read from what it logged. Runs are interleaved, A B A B, and compared round by round: a machine whose speed drifts
+by 20 % moves both sides of a ratio alike, and the same script given twice shows how much noise is left. With
+`--jobs 2` a contender runs as two processes that share the threads, and their steps/s add up over the time in which
+both are past their warm-up.
+
+Standard output gets three tables: speed; where an iteration's time goes; and how far each run is from two limits
+measured just before, the convolutions that the processor can compute and the steps that the bare emulator can make.
+The CSV gets a row for each process as soon as it ends, `time/…` in seconds. Expect about a minute for each contender
+and round at 600 steps/s.
+
+`--peer` needs `pip install -e '.[peer]'`. CleanRL needs an older Gymnasium and so an interpreter of its own,
+`--cleanrl-python`: one that has torch, gymnasium 0.29.1, ale-py 0.10.1, numpy 1, opencv-python-headless 4,
+tensorboard and tyro.
+"""
+
+import csv
+import importlib.metadata
+import itertools
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from multiprocessing import get_context
+from pathlib import Path
+from statistics import median
+from typing import NoReturn
+
+import ale_py
+import gymnasium as gym
+import tyro
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+NUM_STEPS = 128  # agent steps of each environment in one iteration (appendix A): the default of every contender
+PHASES = tuple(f"time/{phase}" for phase in "inference environment storage advantages update kl_pass logging".split())
+REST = "time/unaccounted"  # what an iteration takes beyond its phases
+OVERHEAD = ("time/storage", "time/advantages", "time/logging", REST)  # outside environment, network and optimizer
+LIMITS = ("float32_gflops", "bfloat16_gflops", "emulator_steps_per_second")
+CSV_FIELDS = "date env_id contender commit torch cpu round job num_envs threads jobs warmup window".split()
+CSV_FIELDS += ["steps_per_second", "peak_mb", "time/first_iteration", "time/iteration", *PHASES, REST, *LIMITS]
+
+# Work of the Nature CNN in MFLOP a sample, a multiplication and its addition counted as two
+FIRST_LAYER = 2 * 20 * 20 * 32 * 256 / 1e6
+FORWARD = FIRST_LAYER + 2 * (9 * 9 * 64 * 512 + 7 * 7 * 64 * 576 + 3136 * 512) / 1e6  # 18.7
+# The backward pass makes two gradients at the forward pass's price, weights' and inputs'; nobody needs a screen's
+BACKWARD = 2 * FORWARD - FIRST_LAYER
+AGENT_STEP = FORWARD + 4 * (FORWARD + BACKWARD)  # 217: the rollout, then four epochs
+KL_PASS = FORWARD  # the scripts look at the rollout once more, peers do not
+
+
+def available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+
+
+@dataclass
+class Args:
+    contenders: tyro.conf.Positional[tuple[str, ...]]
+    """scripts to measure, each with its flags in one string; all are compared with the first"""
+    env_id: str = "Breakout"
+    """the environment, named as for the scripts; limits and peers need an Atari game"""
+    rounds: int = 3
+    """times that every contender is run"""
+    warmup: int = 3
+    """iterations before the window, in which memory and caches settle"""
+    window: int = 30
+    """iterations that are measured"""
+    threads: tuple[int, ...] = field(default_factory=lambda: (available_cores(),))
+    """threads of a contender, over all its jobs; the default is the cores this process may use. Several values give
+    a row each, as for the next two"""
+    jobs: tuple[int, ...] = (1,)
+    """processes that a contender is run as at once, with threads / jobs each, at least 1"""
+    num_envs: tuple[int, ...] = (8,)
+    """environments that a process plays at once"""
+    peer: bool = False
+    """measure Stable-Baselines3's PPO too"""
+    cleanrl: Path | None = None
+    """measure cleanrl/ppo_atari.py of this checkout of CleanRL too"""
+    cleanrl_python: str = sys.executable
+    """the interpreter that CleanRL is run with"""
+    csv: Path = Path(__file__).parent / "results" / "throughput.csv"
+    """file that the rows are appended to"""
+
+    def check(self) -> None:
+        """Ends the program with status 2 at the first argument that cannot work."""
+        for name in ("rounds", "warmup", "window", "threads", "jobs", "num_envs"):
+            given = getattr(self, name)
+            if (smallest := min(given) if isinstance(given, tuple) else given) < 1:
+                refuse(f"--{name.replace('_', '-')} {smallest}", "give a number above 0")
+        if not self.contenders:
+            refuse("no contender", "name a script, for example ppo_atari.py")
+        if (self.peer or self.cleanrl) and (find_atari_game(self.env_id) is None or "/" in self.env_id):
+            refuse(f"--env-id {self.env_id}", "peers play Atari without sticky actions; give a game such as Breakout")
+
+
+def refuse(given: str, advice: str) -> NoReturn:
+    print(f"{given}: {advice}", file=sys.stderr)
+    sys.exit(2)
+
+
+def find_atari_game(env_id: str) -> tuple[str, str] | None:
+    """Returns a game's registered name and its ROM (`Breakout`, `breakout`), or None where it is not one."""
+    gym.register_envs(ale_py)
+    name = re.sub(r"^ale/|_|noframeskip-v4$|-v5$", "", env_id.lower())
+    games = {spec.name.lower(): spec for spec in gym.registry.values() if spec.namespace == "ALE"}
+    return (games[name].name, games[name].kwargs["game"]) if name in games else None
+
+
+def prepare_csv(path: Path) -> None:
+    """Makes the file with its header, or checks that rows can follow those that it has."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a+", newline="") as file:
+            file.seek(0)
+            header = next(csv.reader(file), None)
+            if header is None:
+                csv.writer(file).writerow(CSV_FIELDS)
+    except OSError as error:
+        refuse(f"--csv {path}", f"cannot be written ({error.strerror}); give another file")
+    if header not in (None, CSV_FIELDS):
+        refuse(f"--csv {path}", "it holds other columns than these runs have; give another file")
+
+
+# -------------------------------------------------------------------------------------------------- contenders
+@dataclass
+class Contender:
+    name: str
+    command: tuple[str, ...]  # all but the size of the run
+    commit: str
+    torch: str  # version
+    peer: bool = False
+    environment: dict[str, str] = field(default_factory=dict)  # on top of this program's
+
+
+def make_contenders(args: Args) -> list[Contender]:
+    """Turns the command line into contenders, the scripts first; what cannot be run ends the program."""
+    torch, contenders = importlib.metadata.version("torch"), []
+    for i, given in enumerate(args.contenders):
+        try:
+            script, *flags = shlex.split(given) or [""]
+        except ValueError as error:
+            refuse(repr(given), f"{error}; a script and its flags are read as a shell reads them")
+        if not Path(script).is_file():
+            refuse(repr(given), "no such script; give a path, with the script's flags inside the same quotes")
+        for flag in flags:
+            if re.match(r"--(env.id|num.envs|num.steps|total.timesteps|threads|log.dir)\b", flag):
+                refuse(repr(given), f"{flag} is set here, for all contenders alike; leave it out")
+        repeat = args.contenders[:i].count(given)
+        command = (sys.executable, script, *flags, "--env-id", args.env_id)
+        name = f"{given} ({repeat + 1})" if repeat else given
+        contenders.append(Contender(name, command, commit_of(Path(script).parent), torch))
+    if args.peer:
+        try:
+            version = importlib.metadata.version("stable-baselines3")
+        except importlib.metadata.PackageNotFoundError:
+            refuse("--peer", "Stable-Baselines3 is not installed; pip install -e '.[peer]'")
+        script = Path(__file__).resolve().parent / "sb3_ppo.py"
+        command = (sys.executable, str(script), "--env-id", f"{find_atari_game(args.env_id)[0]}NoFrameskip-v4")
+        contenders.append(Contender(f"Stable-Baselines3 {version}", command, commit_of(script.parent), torch, True))
+    if args.cleanrl:
+        script, python = args.cleanrl.resolve() / "cleanrl" / "ppo_atari.py", shutil.which(args.cleanrl_python)
+        if not script.is_file():
+            refuse(f"--cleanrl {args.cleanrl}", "no cleanrl/ppo_atari.py in it; give the directory of a checkout")
+        ask = [python, "-c", "import importlib.metadata; print(importlib.metadata.version('torch'))"]
+        if not python or not (torch := subprocess.run(ask, capture_output=True, text=True).stdout.strip()):
+            refuse(f"--cleanrl-python {args.cleanrl_python}", "not an interpreter that has torch")
+        # The prefix has Gymnasium import ale-py: under 0.29 the versions that ship ROMs do not register by themselves
+        env_id = f"ale_py:{find_atari_game(args.env_id)[0]}NoFrameskip-v4"
+        command = (os.path.abspath(python), str(script), "--env-id", env_id, "--no-cuda")
+        environment = {"PYTHONPATH": str(args.cleanrl.resolve())}
+        contenders.append(Contender("CleanRL", command, commit_of(script.parent), torch, True, environment))
+    return contenders
+
+
+def commit_of(directory: Path) -> str:
+    git = ["git", "-C", str(directory), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return "not a git checkout"
+
+
+# --------------------------------------------------------------------------------------------- runs and their logs
+@dataclass
+class Iteration:
+    end: float  # seconds since the epoch
+    step: int  # agent steps so far
+    phases: dict[str, float]  # seconds by tag; empty for peers
+
+
+Run = dict[str, float]  # what one process gave, by CSV column; a peer's has no phases
+
+
+@dataclass
+class Row:
+    """A contender at one setting."""
+
+    contender: Contender
+    num_envs: int
+    threads: int
+    jobs: int
+    rounds: list[list[Run]] = field(default_factory=list)  # in each round, a run for each job
+
+    @property
+    def label(self) -> list[str]:
+        return [self.contender.name, str(self.num_envs), str(self.threads), str(self.jobs)]
+
+    @property
+    def speeds(self) -> list[float]:
+        """Steps/s of each round, its jobs together."""
+        return [sum(run["steps_per_second"] for run in runs) for runs in self.rounds]
+
+    def all(self, column: str) -> list[float]:
+        """One number of every run, 0 where it has none."""
+        return [run.get(column, 0.0) for runs in self.rounds for run in runs]
+
+
+def read_iterations(directory: Path) -> list[Iteration]:
+    """Reads the event file somewhere under `directory`; an iteration ends when `charts/SPS` is logged."""
+    file = next(directory.rglob("events.out.tfevents*"), directory)
+    reader = EventAccumulator(str(file), size_guidance={"scalars": 0})  # 0: every point
+    reader.Reload()
+    if "charts/SPS" not in (logged := reader.Tags()["scalars"]):
+        return []
+    seconds = {tag: {event.step: event.value for event in reader.Scalars(tag)} for tag in PHASES if tag in logged}
+    return [
+        Iteration(event.wall_time, event.step, {tag: at_step[event.step] for tag, at_step in seconds.items()})
+        for event in reader.Scalars("charts/SPS")
+    ]
+
+
+def measure(iterations: list[Iteration], start: float, end: float) -> Run:
+    """Measures the iterations between two times, from the end of the first iteration that ended there."""
+    inside = [iteration for iteration in iterations if start <= iteration.end <= end]
+    if len(inside) < 2:
+        sys.exit("the jobs have no iteration in common after their warm-up: give a longer --window")
+    seconds = [after.end - before.end for before, after in itertools.pairwise(inside)]
+    run = {"steps_per_second": (inside[-1].step - inside[0].step) / sum(seconds), "time/iteration": median(seconds)}
+    for tag in inside[0].phases:
+        run[tag] = median(iteration.phases[tag] for iteration in inside[1:])
+    if inside[0].phases:
+        run[REST] = median(total - sum(later.phases.values()) for total, later in zip(seconds, inside[1:]))
+    return run
+
+
+def run_process(row: Row, needed: int, directory: Path) -> tuple[list[Iteration], Run]:
+    """Runs one job for `needed` iterations, and returns them with what only the process as a whole can tell."""
+    contender, threads = row.contender, str(max(1, row.threads // row.jobs))
+    command = [*contender.command, "--num-envs", str(row.num_envs)]
+    command += ["--total-timesteps", str(row.num_envs * NUM_STEPS * needed)]
+    environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", **contender.environment}
+    if contender.peer:  # has no flags for these: torch takes its threads from here, and `runs` is made where it stands
+        environment |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
+    else:
+        command += ["--threads", threads, "--log-dir", str(directory)]
+    where = {"cwd": directory if contender.peer else None, "env": environment}
+    with (directory / "stderr").open("w+", errors="replace") as stderr:
+        started = time.time()
+        child = subprocess.Popen(command, **where, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr)
+        # Peak memory of this child alone. Linux counts what its parent held when it started, so a run never shows
+        # less than this program holds: torch is left to the probes' own processes.
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        stderr.seek(0)
+        if child.returncode != 0:
+            sys.exit(f"{contender.name} ended with status {child.returncode}: {last_words(stderr.read())}")
+    iterations = read_iterations(directory)
+    if len(iterations) < needed:
+        sys.exit(f"{contender.name} logged {len(iterations)} iterations instead of {needed}")
+    kib = usage.ru_maxrss / (1024 if sys.platform == "darwin" else 1)
+    return iterations[:needed], {"peak_mb": kib * 1024 / 1e6, "time/first_iteration": iterations[0].end - started}
+
+
+def run_jobs(row: Row, args: Args) -> list[Run]:
+    """Runs all jobs of a row at once. Their speed is measured only while all are past their warm-up and none done."""
+    with tempfile.TemporaryDirectory(prefix="throughput-") as top, ThreadPoolExecutor(row.jobs) as pool:
+        directories = [Path(tempfile.mkdtemp(dir=top)) for _ in range(row.jobs)]
+        jobs = list(pool.map(lambda directory: run_process(row, args.warmup + args.window, directory), directories))
+    start = max(iterations[args.warmup - 1].end for iterations, _ in jobs)
+    end = min(iterations[-1].end for iterations, _ in jobs)
+    return [{**measure(iterations, start, end), **of_process} for iterations, of_process in jobs]
+
+
+def last_words(stderr: str) -> str:
+    """Returns the last line, or the first in the box that tyro draws around what is wrong and what to read."""
+    box = re.search(r"^╭.*\n│(.*)│$", stderr, re.MULTILINE)
+    return (box[1] if box else (stderr.strip() or "no message").splitlines()[-1]).strip()
+
+
+# ------------------------------------------------------------------------------------------------------ limits
+def probe_convolutions(threads: int, dtype_name: str, seconds: float = 2.0) -> float:
+    """Returns the best GFLOP/s of the network's three convolutions, forward and backward on 256 samples.
+
+    Without bfloat16 instructions each takes about a second, so the time is checked after every one of them.
+    """
+    import torch
+
+    torch.set_num_threads(threads)
+    layers = []
+    for inputs, outputs, kernel, stride, size in ((4, 32, 8, 4, 84), (32, 64, 4, 2, 20), (64, 64, 3, 1, 9)):
+        layout = {"dtype": getattr(torch, dtype_name), "memory_format": torch.channels_last}
+        screens = torch.rand(256, inputs, size, size).to(**layout).requires_grad_(inputs > 4)
+        layers.append((torch.nn.Conv2d(inputs, outputs, kernel, stride).to(**layout), screens))
+    best, stop = 0.0, time.perf_counter() + seconds
+    for convolution, screens in itertools.cycle(layers):
+        if (start := time.perf_counter()) > stop:
+            return best
+        output = convolution(screens)
+        output.backward(output.detach())
+        elapsed = time.perf_counter() - start
+        flop = 2 * output.numel() * convolution.weight[0].numel() * (3 if screens.requires_grad else 2)
+        best = max(best, flop / elapsed / 1e9)
+
+
+def probe_emulator(rom: str, num_envs: int, threads: int, seconds: float = 2.0) -> float:
+    """Returns the best steps/s of the emulator over an eighth of the time: random actions, the network's screens."""
+    import numpy as np
+    from ale_py.vector_env import AtariVectorEnv
+
+    envs = AtariVectorEnv(rom, num_envs, num_threads=threads, use_fire_reset=False)
+    envs.reset(seed=1)
+    actions = itertools.cycle(np.random.default_rng(1).integers(envs.single_action_space.n, size=(1000, num_envs)))
+    best = 0.0
+    for _ in range(8):
+        steps, start = 0, time.perf_counter()
+        while (elapsed := time.perf_counter() - start) < seconds / 8:
+            envs.step(next(actions))
+            steps += num_envs
+        best = max(best, steps / elapsed)
+    return best
+
+
+def measure_limits(args: Args) -> dict[tuple[int, int], dict[str, float]]:
+    """Returns the limits for each number of environments and threads; none outside Atari."""
+
+    def in_own_process(function, *arguments):  # where thread counts hold
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            return pool.submit(function, *arguments).result()
+
+    limits = {}
+    for threads in args.threads if (game := find_atari_game(args.env_id)) else ():
+        convolutions = [in_own_process(probe_convolutions, threads, dtype) for dtype in ("float32", "bfloat16")]
+        for num_envs in args.num_envs:
+            emulator = in_own_process(probe_emulator, game[1], num_envs, threads)
+            limits[num_envs, threads] = dict(zip(LIMITS, [*convolutions, emulator]))
+    return limits
+
+
+# ------------------------------------------------------------------------------------------------------ tables
+LABEL = ["contender", "envs", "threads", "jobs"]
+
+
+def markdown(header: list[str], rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["-"] * len(header), *rows)) + "\n"
+
+
+def spread(values: list[float], digits: int = 0) -> str:
+    """Median (minimum to maximum)."""
+    middle, low, high = (f"{value:,.{digits}f}" for value in (median(values), min(values), max(values)))
+    return f"{middle} ({low} to {high})"
+
+
+def ratios(row: Row, baseline: Row) -> list[float]:
+    """How many times as fast as the baseline, round by round."""
+    return [speed / baseline_speed for speed, baseline_speed in zip(row.speeds, baseline.speeds)]
+
+
+def speed_table(rows: list[Row]) -> str:
+    """Speeds, and their ratios to the first row and to each peer at the row's own setting."""
+    peers = list(dict.fromkeys(row.contender.name for row in rows if row.contender.peer))
+    at = {tuple(row.label): row for row in rows}
+    table = []
+    for row in rows:
+        baselines = [rows[0], *(at[(peer, *row.label[1:])] for peer in peers)]
+        times = ["–" if row is baseline else spread(ratios(row, baseline), 2) for baseline in baselines]
+        ends = [spread(row.all("peak_mb")), spread(row.all("time/first_iteration"), 1)]
+        table.append([*row.label, spread(row.speeds), *times, *ends])
+    ratio_names = ["× first row", *(f"× {peer}" for peer in peers)]
+    return markdown([*LABEL, "steps/s", *ratio_names, "peak MB a process", "first iteration after, s"], table)
+
+
+def phase_table(rows: list[Row]) -> str:
+    """Milliseconds and share of an iteration: medians, so they need not add up exactly. Peers log no phases."""
+    table = []
+    for row in rows:
+        iteration = row.all("time/iteration")
+        columns = [row.all(tag) for tag in (*PHASES, REST)]
+        columns.append([sum(parts) for parts in zip(*(row.all(tag) for tag in OVERHEAD))])
+        shares = [median(s / total for s, total in zip(seconds, iteration)) for seconds in columns]
+        cells = [f"{1000 * median(seconds):.0f} ({share:.1%})" for seconds, share in zip(columns, shares)]
+        if not row.contender.peer:
+            table.append([*row.label, f"{1000 * median(iteration):.0f}", *cells])
+    phases = [tag.removeprefix("time/") for tag in (*PHASES, REST)]
+    return markdown([*LABEL, "iteration, ms", *phases, "outside environment, network and optimizer"], table)
+
+
+def limits_table(rows: list[Row], limits: dict[tuple[int, int], dict[str, float]]) -> str:
+    """The share of each limit that a row reaches, and the limit in agent steps/s. `in turn`: one, then the other."""
+    table = []
+    for row in rows:
+        float32, bfloat16, emulator = limits[row.num_envs, row.threads].values()
+        mflop = AGENT_STEP if row.contender.peer else AGENT_STEP + KL_PASS
+        bounds = [1000 * float32 / mflop, 1000 * bfloat16 / mflop, emulator]
+        bounds += [1 / (1 / bound + 1 / emulator) for bound in bounds[:2]]
+        table.append([*row.label, *(f"{median(row.speeds) / bound:.0%} of {bound:,.0f}" for bound in bounds)])
+    columns = ["float32 convolutions", "bfloat16 convolutions", "bare emulator"]
+    return markdown([*LABEL, *columns, *(f"{column} and emulator in turn" for column in columns[:2])], table)
+
+
+# ------------------------------------------------------------------------------------------------- command line
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    args.check()
+    contenders = make_contenders(args)
+    prepare_csv(args.csv)  # last, so that nothing refused above leaves a file behind
+    # The contenders of one setting follow each other, so that what is compared most is closest in time
+    settings = itertools.product(args.num_envs, args.threads, args.jobs)
+    rows = [Row(contender, *setting) for setting in settings for contender in contenders]
+    cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    cpu = (re.findall(r"model name\s*: (.*)", cpuinfo) or ["unknown processor"])[0]
+
+    limits = measure_limits(args)
+    for (num_envs, threads), limit in limits.items():
+        float32, bfloat16, emulator = (f"{value:,.0f}" for value in limit.values())
+        print(
+            f"Limits with {threads} threads: convolutions {float32} GFLOP/s in float32 and {bfloat16} in bfloat16, "
+            f"emulator {emulator} steps/s in {num_envs} environments."
+        )
+    for number in range(1, args.rounds + 1):
+        for row in rows:
+            row.rounds.append(run_jobs(row, args))
+            print(f"round {number}, {' / '.join(row.label)}: {row.speeds[-1]:,.0f} steps/s", file=sys.stderr)
+            for job, run in enumerate(row.rounds[-1], start=1):
+                date = datetime.now(timezone.utc).isoformat(timespec="seconds")
+                numbers = {**run, **limits.get((row.num_envs, row.threads), {})}
+                numbers = {column: f"{value:.6g}" for column, value in numbers.items()}
+                identity = {"contender": row.contender.name, "date": date, "cpu": cpu, "round": number, "job": job}
+                # The row after the arguments: it has one value where they have several
+                record = {**vars(args), **vars(row.contender), **vars(row), **identity, **numbers}
+                with args.csv.open("a", newline="") as file:
+                    csv.DictWriter(file, CSV_FIELDS, extrasaction="ignore").writerow(record)
+
+    versions = f"torch {contenders[0].torch}, commit {contenders[0].commit}"
+    protocol = f"{args.rounds} rounds of {args.window} iterations after {args.warmup}; median (minimum to maximum)"
+    print(f"\n{args.env_id} on {cpu}, {available_cores()} cores, {versions}; {protocol}.\n")
+    print(speed_table(rows))
+    print(phase_table(rows))
+    if limits:
+        print(limits_table(rows, limits))
+
+
+if __name__ == "__main__":
+    main()

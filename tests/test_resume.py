@@ -1,0 +1,403 @@
+"""A run is never lost: checkpoints, resuming, signals, and faults that are provoked for real."""
+
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from tbparse import SummaryReader
+
+from conftest import SCRIPTS, TINY_PIXELS, run_script, scalars, values
+from wrappers import make_envs
+
+SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
+EVERY_ITERATION = "charts/learning_rate"
+
+
+def flags_of(**arguments) -> list[str]:
+    return [word for name, value in arguments.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+
+
+def run_dir_in(directory: Path) -> Path:
+    (run_dir,) = (directory / "runs").iterdir()
+    return run_dir
+
+
+def checkpoint_of(run_dir: Path) -> dict:
+    return torch.load(run_dir / "checkpoint.pt", weights_only=True)
+
+
+def per_iteration(logged: dict) -> dict[str, list[int]]:
+    """Steps of the tags that are written once an iteration."""
+    return {tag: [step for step, _ in points] for tag, points in logged.items() if "episodic_" not in tag}
+
+
+@pytest.mark.parametrize("env_id", ["CartPole-v1", pytest.param(TINY_PIXELS, marks=pytest.mark.slow)])
+def test_stopped_and_resumed_logs_what_straight_through_logs(script, env_id, tmp_path):
+    """The games start anew, so that their scores differ; schedule, steps and tags do not."""
+    flags = flags_of(env_id=env_id, total_timesteps=1280, **SMALL)
+    for name in ("straight", "stopped"):
+        (tmp_path / name).mkdir()
+    assert run_script(script, *flags, cwd=tmp_path / "straight").returncode == 0
+    stopped = run_script(script, *flags, "--stop-at", "600", cwd=tmp_path / "stopped")
+    run_dir = run_dir_in(tmp_path / "stopped")
+    assert stopped.returncode == 0 and checkpoint_of(run_dir)["global_step"] == 640
+    resumed = run_script(script, "--resume", f"runs/{run_dir.name}", cwd=tmp_path / "stopped")
+    assert (resumed.returncode, resumed.stderr) == (0, "")
+
+    straight, both = scalars(run_dir_in(tmp_path / "straight")), scalars(run_dir)
+    assert both[EVERY_ITERATION] == straight[EVERY_ITERATION]
+    assert per_iteration(both) == per_iteration(straight)
+    frame = SummaryReader(str(run_dir)).scalars
+    for tag, steps in per_iteration(both).items():
+        assert frame[frame.tag == tag].step.tolist() == steps, tag
+
+
+def test_adams_moments_and_the_random_state_survive(script, tmp_path):
+    """Resumed at the step where it stops, a run writes the checkpoint that it has read."""
+    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=384, **SMALL)
+    script.train(args, make_envs("CartPole-v1", 4), script.RunDirectory(str(tmp_path)))
+    before = checkpoint_of(tmp_path)
+    run = script.RunDirectory.__new__(script.RunDirectory)  # the first one holds the lock of this process
+    vars(run).update(path=str(tmp_path), checkpoint=str(tmp_path / "checkpoint.pt"), writer=None)
+    vars(run).update(failed=False, waiting=False)
+    script.train(args, make_envs("CartPole-v1", 4), run, run.load())
+    after = checkpoint_of(tmp_path)
+    assert before["optimizer"].keys() == after["optimizer"].keys() and len(before["optimizer"]) > 0
+    for index, moments in before["optimizer"].items():
+        assert moments.keys() == {"step", "exp_avg", "exp_avg_sq"}
+        assert all(torch.equal(value, after["optimizer"][index][name]) for name, value in moments.items())
+    assert all(torch.equal(value, after["agent"][name]) for name, value in before["agent"].items())
+    assert torch.equal(before["rng"], after["rng"])
+    assert before["last_scores"] == after["last_scores"] and len(before["last_scores"]) > 0
+    assert (before["starts"], after["starts"]) == (1, 2)
+
+
+def killed_and_resumed(script, tmp_path, kills: int, seed: int) -> dict:
+    """Kills a run with SIGKILL at random instants, resumes it each time to the end, and returns what was logged.
+
+    A checkpoint is due after every iteration, so that many kills fall into the writing of one; none may lose more than
+    the iteration in progress.
+    """
+    moments = random.Random(seed)
+    flags = flags_of(env_id="CartPole-v1", total_timesteps=128_000, checkpoint_minutes=0, **SMALL)
+    command, saved = [sys.executable, script.__file__, *flags], 0
+    for _ in range(kills):
+        process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        while not (tmp_path / "runs").exists() or not list((tmp_path / "runs").glob("*/checkpoint.pt")):
+            time.sleep(0.01)
+        run_dir = run_dir_in(tmp_path)
+        begun = checkpoint_of(run_dir)["starts"]
+        while checkpoint_of(run_dir)["starts"] == begun and command[2] == "--resume" and process.poll() is None:
+            time.sleep(0.01)
+        time.sleep(moments.uniform(0, 0.3))
+        process.kill()
+        assert process.communicate()[1] == "" and process.returncode == -signal.SIGKILL
+        state = checkpoint_of(run_dir)
+        logged_steps = [step for step, _ in scalars(run_dir).get(EVERY_ITERATION, [])]
+        assert state["global_step"] >= saved
+        assert max(logged_steps, default=0) - state["global_step"] <= 128  # one checkpoint interval: an iteration
+        saved = state["global_step"]
+        command = [sys.executable, script.__file__, "--resume", str(run_dir)]
+    last = subprocess.run([*command, "--stop-at", str(saved + 640)], cwd=tmp_path, capture_output=True, text=True)
+    assert (last.returncode, last.stderr) == (0, "")
+    return scalars(run_dir)
+
+
+def check_one_continuous_curve(logged: dict) -> None:
+    for tag, steps in per_iteration(logged).items():
+        assert len(steps) == len(set(steps)) and steps == sorted(steps), tag
+    steps = per_iteration(logged)[EVERY_ITERATION]
+    assert steps == list(range(128, steps[-1] + 1, 128))
+    rates = [2.5e-4 * (1 - i / 1000) for i in range(len(steps))]
+    assert values(logged, EVERY_ITERATION) == pytest.approx(rates)
+
+
+def test_a_run_killed_twice_is_one_continuous_curve(script, tmp_path):
+    check_one_continuous_curve(killed_and_resumed(script, tmp_path, kills=2, seed=1))
+
+
+@pytest.mark.slow
+def test_a_run_killed_thirty_times_is_one_continuous_curve(script, tmp_path):
+    check_one_continuous_curve(killed_and_resumed(script, tmp_path, kills=30, seed=2))
+
+
+@pytest.fixture(scope="module")
+def finished_runs(tmp_path_factory):
+    """A short finished run of each script, not to be changed: copy it."""
+    runs = {}
+
+    def run_of(script) -> Path:
+        if script not in runs:
+            directory = tmp_path_factory.mktemp(script.__name__)
+            flags = flags_of(env_id="CartPole-v1", total_timesteps=256, **SMALL)
+            assert run_script(script, *flags, cwd=directory).returncode == 0
+            runs[script] = run_dir_in(directory)
+        return runs[script]
+
+    return run_of
+
+
+@pytest.fixture
+def finished(script, finished_runs, tmp_path) -> Path:
+    """A copy of a finished run's directory, under `runs/` of the test's own directory."""
+    original = finished_runs(script)
+    return Path(shutil.copytree(original, tmp_path / "runs" / original.name))
+
+
+def test_a_finished_run_says_so_and_goes_on_with_more_steps(script, finished, tmp_path):
+    again = run_script(script, "--resume", str(finished), cwd=tmp_path)
+    assert again.returncode == 0 and "has finished at step 256" in again.stdout and again.stderr == ""
+    longer = run_script(script, "--resume", str(finished), "--total-timesteps", "512", cwd=tmp_path)
+    assert (longer.returncode, longer.stderr) == (0, "")
+    assert scalars(finished)[EVERY_ITERATION] == [
+        (128, pytest.approx(2.5e-4)),
+        (256, pytest.approx(1.25e-4)),
+        (384, pytest.approx(1.25e-4)),
+        (512, pytest.approx(0.625e-4)),
+    ]
+    frame = SummaryReader(str(finished)).text
+    assert any("|total_timesteps|512|" in text for text in frame.value)
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--env-id", "Breakout"], "--env-id Breakout: the run has CartPole-v1, which cannot change"),
+        (["--num-envs", "8"], "--num-envs 8: the run has 4, which cannot change"),
+        (["--seed", "2"], "--seed 2: the run has 1, which cannot change"),
+        (["--gamma", "2", "--total-timesteps", "512"], "--gamma 2.0: give a number from 0 to 1"),
+    ],
+)
+def test_what_cannot_change_is_refused(script, finished, call_main, flags, message):
+    assert call_main(script, "--resume", str(finished), *flags) == (2, "", message + "\n")
+
+
+def test_the_run_of_the_other_script_is_refused(script, finished_runs, tmp_path, call_main):
+    (other,) = set(SCRIPTS.values()) - {script}
+    run_dir = shutil.copytree(finished_runs(other), tmp_path / "other")
+    status, _, said = call_main(script, "--resume", str(run_dir))
+    assert (status, said) == (2, f"--resume {run_dir}: its checkpoint is damaged, or of another script\n")
+
+
+@pytest.mark.parametrize("contents", [None, b"", b"no zip file"])
+def test_a_directory_without_a_checkpoint_is_refused(script, contents, tmp_path, call_main):
+    if contents is not None:
+        (tmp_path / "checkpoint.pt").write_bytes(contents)
+    status, _, said = call_main(script, "--resume", str(tmp_path))
+    assert status == 2 and said.count("\n") == 1
+    assert ("it holds no checkpoint" if contents is None else "damaged") in said
+
+
+def test_a_directory_that_is_not_there_is_refused(script, call_main):
+    assert call_main(script, "--resume", "nowhere") == (2, "", "--resume nowhere: No such file or directory\n")
+
+
+def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
+    """A byte of padding between the parts of the file may change; nothing that is read from it may."""
+    run = script.RunDirectory(str(finished))
+    path, offsets = finished / "checkpoint.pt", random.Random(3)
+    whole, original = path.read_bytes(), run.load()
+    refused = 0
+    for attempt in range(200):
+        damaged = bytearray(whole)
+        if attempt % 4 == 0:
+            damaged = damaged[: offsets.randrange(len(whole))]
+        else:
+            damaged[offsets.randrange(len(whole))] ^= 1 << offsets.randrange(8)
+        path.write_bytes(damaged)
+        try:
+            state = run.load()
+        except ValueError as error:
+            refused += "damaged" in str(error)
+        else:
+            assert attempt % 4 != 0
+            assert state["args"] == original["args"] and state["global_step"] == original["global_step"]
+            assert all(torch.equal(value, original["agent"][name]) for name, value in state["agent"].items())
+            for index, moments in original["optimizer"].items():
+                assert all(torch.equal(value, state["optimizer"][index][name]) for name, value in moments.items())
+    assert refused > 100
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda state: {**state, "args": {**state["args"], "learning_rate": "fast"}},
+        lambda state: {**state, "agent": {"weight": torch.zeros(2)}},
+        lambda state: {name: value for name, value in state.items() if name != "rng"},
+        lambda state: {},
+        lambda state: [1, 2],
+    ],
+    ids=["a number as text", "another network", "a part missing", "nothing", "a list"],
+)
+def test_a_checkpoint_changed_by_hand_is_refused_in_one_line(script, finished, change, call_main):
+    torch.save(change(checkpoint_of(finished)), finished / "checkpoint.pt")
+    status, out, said = call_main(script, "--resume", str(finished), "--total-timesteps", "512")
+    assert (
+        (status, out) == (2, "") and said.startswith(f"--resume {finished}: its checkpoint") and said.count("\n") == 1
+    )
+
+
+def test_two_processes_cannot_hold_one_run(script, finished, tmp_path):
+    held = script.RunDirectory(str(finished))
+    second = run_script(script, "--resume", str(finished), "--total-timesteps", "512", cwd=tmp_path)
+    os.close(held.lock)
+    assert second.returncode == 2
+    assert second.stderr == f"--resume {finished}: another process is training there; wait for its end\n"
+    third = run_script(script, "--resume", str(finished), "--total-timesteps", "512", cwd=tmp_path)
+    assert third.returncode == 0
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])
+def test_a_signal_ends_the_run_with_a_checkpoint_and_the_command_to_go_on(script, number, tmp_path):
+    flags = flags_of(env_id="CartPole-v1", total_timesteps=10_000_000, **SMALL)
+    process = subprocess.Popen(
+        [sys.executable, script.__file__, *flags], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    wait_for_a_point(tmp_path)
+    process.send_signal(number)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 128 + number
+    run_dir = run_dir_in(tmp_path)
+    assert f"--resume runs/{run_dir.name}" in said
+    assert checkpoint_of(run_dir)["global_step"] == scalars(run_dir)[EVERY_ITERATION][-1][0] > 0
+
+
+def wait_for_a_point(directory: Path) -> None:
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if (directory / "runs").exists() and scalars(run_dir_in(directory)).get(EVERY_ITERATION):
+            return
+        time.sleep(0.1)
+    raise TimeoutError
+
+
+@pytest.mark.slow
+def test_a_second_signal_ends_at_once(script, tmp_path):
+    """An iteration that takes an hour is not waited for."""
+    flags = flags_of(env_id="CartPole-v1", num_envs=4, num_steps=1_000_000, total_timesteps=4_000_000, threads=1)
+    process = subprocess.Popen(
+        [sys.executable, script.__file__, *flags], cwd=tmp_path, stderr=subprocess.PIPE, text=True
+    )
+    while not list(tmp_path.glob("runs/*/checkpoint.pt")):
+        time.sleep(0.1)
+    process.send_signal(signal.SIGTERM)
+    assert "once more" in process.stderr.readline() + process.stderr.readline()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=10) == -signal.SIGTERM
+
+
+@pytest.mark.parametrize("where", ["value_loss", "surrogate"])
+def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, where, tmp_path, monkeypatch):
+    function, calls = getattr(script, where), []
+    poisoned = lambda *given: function(*given) * (float("nan") if calls.append(1) or len(calls) > 16 else 1)  # noqa: E731
+    monkeypatch.setattr(script, where, poisoned)
+    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, checkpoint_minutes=0, **SMALL)
+    with pytest.raises(SystemExit) as stopped:
+        script.train(args, make_envs("CartPole-v1", 4), script.RunDirectory(str(tmp_path)))
+    assert re.search(r"not finite in iteration 2, step 256: .*(policy_loss|value_loss).*actor", stopped.value.code)
+    state = checkpoint_of(tmp_path)
+    assert state["global_step"] == 128
+    assert all(value.isfinite().all() for value in state["agent"].values())
+
+
+@pytest.mark.parametrize("bytes_allowed", [pytest.param(40_000, marks=pytest.mark.slow), 120_000])
+def test_a_full_disk_is_said_once_and_training_goes_on(script, bytes_allowed, tmp_path):
+    """No file may grow beyond the limit: the event file (40 kB) or neither it nor the checkpoint can be written."""
+    flags = flags_of(env_id="CartPole-v1", total_timesteps=25_600, checkpoint_minutes=0, **SMALL)
+    run = subprocess.run(
+        [sys.executable, script.__file__, *flags],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_allowed, bytes_allowed)),
+    )
+    assert run.returncode == 1
+    assert run.stderr.count("\n") == 1 and "training goes on" in run.stderr
+
+
+def test_the_last_checkpoint_is_enough_to_play(script, finished):
+    state = checkpoint_of(finished)
+    envs = make_envs(state["args"]["env_id"], 1)
+    agent = script.Agent(envs.single_observation_space.shape, int(envs.single_action_space.n))
+    agent.load_state_dict(state["agent"])
+    obs, _ = envs.reset(seed=[1])
+    for _ in range(10):
+        actions, _, _ = script.act(agent, torch.from_numpy(obs).movedim(1, -1))
+        obs, *_ = envs.step(actions.numpy())
+
+
+numbers = st.one_of(
+    st.sampled_from(
+        [-1, 0, 1, 2, 3, 4, 32, 128, 1024, 0.1, 0.5, 1e-3, 1e30, "nan", "inf", "-inf", "1e3", "x", "", "None"]
+    ),
+    st.integers(-3, 40),
+    st.floats(-1, 2, allow_nan=False).map(lambda value: f"{value:.3f}"),
+)
+sizes = st.one_of(st.integers(-1, 9), st.sampled_from([16, 32, 64, "4.5", "x"]))
+names = st.sampled_from(
+    ["CartPole-v1", "Acrobot-v1", TINY_PIXELS, "Brekout", "Pendulum-v1", "a:b:c", "", "\n", "ALE/", "-"]
+)
+COMMAND_LINES = st.fixed_dictionaries(
+    {"num_envs": sizes, "num_steps": sizes, "total_timesteps": st.integers(-1, 700)},
+    optional={
+        "env_id": names,
+        "num_minibatches": sizes,
+        "update_epochs": sizes,
+        **{name: numbers for name in ("learning_rate", "gamma", "gae_lambda", "clip_coef", "vf_clip_coef", "ent_coef")},
+        **{
+            name: numbers for name in ("vf_coef", "max_grad_norm", "target_kl", "seed", "checkpoint_minutes", "stop_at")
+        },
+        "exp_name": st.sampled_from(["a", "a/b", "..", "", "ä", "x" * 300]),
+        "log_dir": st.sampled_from(["runs", "a/b", "taken", "taken/b", "/proc/none", ""]),
+        "resume": st.sampled_from(["nowhere", "taken", "", "."]),
+        "threads": st.integers(-1, 2),
+    },
+)
+
+
+@pytest.mark.slow
+def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, capsys, monkeypatch):
+    """300 command lines, sensible and not, through `main` in this process; none may end in a traceback."""
+    outcomes = Counter()
+
+    @settings(max_examples=300, deadline=None, database=None, suppress_health_check=list(HealthCheck))
+    @given(COMMAND_LINES, st.integers(0, 2**63))
+    def check(arguments, number):
+        directory = tmp_path / str(number)
+        directory.mkdir(exist_ok=True)
+        (directory / "taken").write_text("a file")
+        monkeypatch.chdir(directory)
+        arguments = {"env_id": "CartPole-v1", "threads": 1, **arguments}
+        monkeypatch.setattr(
+            sys, "argv", [script.__file__, *(f"--{k.replace('_', '-')}={v}" for k, v in arguments.items())]
+        )
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            script.main()
+        out, err = capsys.readouterr()
+        status = ended.value.code
+        assert "Traceback" not in out + err
+        if status == 2:
+            assert err.count("\n") == 1 or "╭" in err
+            assert [path.name for path in directory.iterdir()] == ["taken"]
+        else:
+            assert status == 0 or "not finite" in str(status)
+        outcomes[status if isinstance(status, int) else 1] += 1
+        shutil.rmtree(directory)
+
+    check()
+    print(json.dumps({"trained": outcomes[0], "refused": outcomes[2], "not finite": outcomes[1]}))
+    assert outcomes[0] > 20 and outcomes[2] > 20

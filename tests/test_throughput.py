@@ -1,0 +1,187 @@
+"""The speed measurements: what is made of the numbers, how they are read, and one call as a user makes it."""
+
+import csv
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+from torch.utils.tensorboard import SummaryWriter
+
+from benchmark import throughput
+from benchmark.throughput import Contender, Row
+from conftest import ROOT
+
+
+def row(name: str, *rounds: list[float], peer: bool = False) -> Row:
+    """A row whose jobs ran at the given steps/s, round by round."""
+    runs = [
+        [{"steps_per_second": speed, "peak_mb": 500, "time/first_iteration": 5} for speed in jobs] for jobs in rounds
+    ]
+    return Row(Contender(name, (), "commit", "2.13.0", peer), num_envs=8, threads=2, jobs=len(rounds[0]), rounds=runs)
+
+
+def log_iterations(directory, ends: list[float], phases: dict[str, list[float]]) -> list[throughput.Iteration]:
+    """Writes an event file with iterations of 1000 agent steps that end at the given times, and reads it."""
+    writer = SummaryWriter(str(directory / "a-run"))
+    for i, end in enumerate(ends):
+        writer.add_scalar("charts/SPS", 0.0, 1000 * (i + 1), walltime=end)
+        for phase, seconds in phases.items():
+            writer.add_scalar(f"time/{phase}", seconds[i], 1000 * (i + 1), walltime=end)
+    writer.close()
+    return throughput.read_iterations(directory)
+
+
+def cells(markdown: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines()]
+
+
+def test_ratios_are_taken_round_by_round_before_their_median():
+    fast, slow = row("fast", [100], [300], [400]), row("slow", [50], [100], [400])
+    assert throughput.ratios(fast, slow) == [2, 3, 1]
+    assert throughput.spread(throughput.ratios(fast, slow), 2) == "2.00 (1.00 to 3.00)"  # of the medians: 3
+    assert throughput.spread(fast.speeds) == "300 (100 to 400)"
+
+
+def test_jobs_add_up_within_a_round():
+    assert row("two at once", [500, 600], [550, 650]).speeds == [1100, 1200]
+
+
+def test_every_row_is_compared_with_the_first_and_with_the_peer_at_its_own_setting():
+    rows = [row("script", [800]), row("peer", [400], peer=True), row("script", [500, 500]), row("peer", [200, 200])]
+    rows[3].contender = rows[1].contender
+    header, _, *table = cells(throughput.speed_table(rows))
+    columns = [header.index(name) for name in ("contender", "jobs", "× first row", "× peer")]
+    assert [[line[column].split(" (")[0] for column in columns] for line in table] == [
+        ["script", "1", "–", "2.00"],
+        ["peer", "1", "0.50", "–"],
+        ["script", "2", "1.25", "2.50"],
+        ["peer", "2", "0.50", "–"],
+    ]
+
+
+def test_speed_and_phases_are_read_from_the_window_alone(tmp_path):
+    phases = {"environment": [9, 9, 0.5, 0.25, 1.0], "update": [9, 9, 1.0, 1.5, 2.0], "storage": [9, 9, 0, 0, 0]}
+    iterations = log_iterations(tmp_path, [1000, 1020, 1022, 1024, 1028], phases)
+    run = throughput.measure(iterations, start=1020, end=1028)  # iterations of 2, 2 and 4 seconds
+    assert run == {
+        "steps_per_second": 3000 / 8,
+        "time/iteration": 2,
+        "time/environment": 0.5,
+        "time/update": 1.5,
+        "time/storage": 0,
+        "time/unaccounted": 0.5,  # of 0.5, 0.25 and 1
+    }
+
+
+def test_the_split_shows_each_phase_and_what_lies_outside_the_work(tmp_path):
+    phases = {"environment": [1, 1, 1], "update": [2, 2, 2], "advantages": [0.25, 0.25, 0.25]}
+    run = throughput.measure(log_iterations(tmp_path, [1000, 1004, 1008], phases), start=1000, end=1008)
+    header, _, line = cells(throughput.phase_table([Row(Contender("script", (), "", ""), 8, 2, 1, [[run]])]))
+    shown = dict(zip(header, line))
+    assert shown["iteration, ms"] == "4000"
+    assert shown["environment"] == "1000 (25.0%)"
+    assert shown["unaccounted"] == "750 (18.8%)"
+    assert shown["outside environment, network and optimizer"] == "1000 (25.0%)"
+
+
+def test_a_peer_logs_no_phases_and_has_no_split(tmp_path):
+    run = throughput.measure(log_iterations(tmp_path, [1000, 1004], {}), start=1000, end=1004)
+    assert run == {"steps_per_second": 250, "time/iteration": 4}
+    assert len(cells(throughput.phase_table([Row(Contender("peer", (), "", "", True), 8, 2, 1, [[run]])]))) == 2
+
+
+def test_limits_are_shared_out_as_agent_steps():
+    gflops = (throughput.AGENT_STEP + throughput.KL_PASS) / 1000  # of one agent step
+    limits = {(8, 2): dict(zip(throughput.LIMITS, (1600 * gflops, 3200 * gflops, 4800)))}
+    shown = cells(throughput.limits_table([row("script", [800])], limits))[2]
+    assert shown[4:] == ["50% of 1,600", "25% of 3,200", "17% of 4,800", "67% of 1,200", "42% of 1,920"]
+
+
+def test_the_work_counted_for_an_agent_step_is_the_networks(script):
+    agent = script.Agent((4, 84, 84), num_actions=4)
+    heads = 2 * 512 * 5 / 1e6  # left out of the constants: they depend on the game
+    with FlopCounterMode(display=False) as forward:
+        logits, values = agent(torch.zeros(2, 84, 84, 4, dtype=torch.uint8))
+    assert forward.get_total_flops() / 2e6 == pytest.approx(throughput.FORWARD + heads)
+    with FlopCounterMode(display=False) as backward:
+        (logits.sum() + values.sum()).backward()
+    assert backward.get_total_flops() / 2e6 == pytest.approx(throughput.BACKWARD + 2 * heads)
+
+
+def test_the_probes_give_a_speed():
+    assert throughput.probe_convolutions(torch.get_num_threads(), "float32", seconds=0.01) > 0
+    assert throughput.probe_emulator("breakout", 2, 1, seconds=0.2) > 0
+
+
+def test_a_call_prints_a_row_for_each_contender_and_appends_one_for_each_process(tmp_path):
+    results = tmp_path / "made" / "throughput.csv"
+    command = [sys.executable, "benchmark/throughput.py", "ppo_atari.py", "acppo_atari.py --c 0", "--csv", str(results)]
+    command += "--env-id CartPole-v1 --rounds 1 --warmup 1 --window 2 --num-envs 2 --threads 1".split()
+    call = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert call.returncode == 0, call.stderr
+    tables = [cells(block) for block in call.stdout.split("\n\n") if block.startswith("|")]
+    assert [len(table) for table in tables] == [4, 4]  # speed and split; no limits outside Atari
+    for table in tables:
+        assert [line[:4] for line in table[2:]] == [
+            ["ppo_atari.py", "2", "1", "1"],
+            ["acppo_atari.py --c 0", "2", "1", "1"],
+        ]
+
+    with results.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [line["contender"] for line in rows] == ["ppo_atari.py", "acppo_atari.py --c 0"]
+    for line, speed_line in zip(rows, tables[0][2:]):
+        assert speed_line[4].startswith(f"{float(line['steps_per_second']):,.0f} (")
+        assert float(line["steps_per_second"]) == pytest.approx(2 * 128 / float(line["time/iteration"]), rel=0.5)
+        assert 50 < float(line["peak_mb"]) < 5000
+        assert 0 < float(line["time/first_iteration"]) < 300
+        assert all(float(line[phase]) > 0 for phase in throughput.PHASES)
+        assert line["torch"].startswith("2.13.0") and line["cpu"] and line["commit"] and line["date"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        ([], "name a script"),
+        (["no_such.py"], "no such script"),
+        (["script.py --threads 1"], "--threads is set here"),
+        (["script.py 'open"], "as a shell reads them"),
+        (["script.py", "--jobs", "1", "0"], "--jobs 0: give a number above 0"),
+        (["script.py", "--window", "0"], "--window 0: give a number above 0"),
+        (["script.py", "--env-id", "CartPole-v1", "--peer"], "a game such as Breakout"),
+        (["script.py", "--env-id", "ALE/Breakout-v5", "--peer"], "a game such as Breakout"),
+        (["script.py", "--cleanrl", "."], "the directory of a checkout"),
+        (["script.py", "--csv", "script.py"], "it holds other columns"),
+        (["script.py", "--csv", "script.py/throughput.csv"], "cannot be written"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line_and_leaves_nothing(flags, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "script.py").write_text("a,script,that,is,never,started\n")
+    csv_flags = [] if "--csv" in flags else ["--csv", "throughput.csv"]
+    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags, *csv_flags])
+    with pytest.raises(SystemExit) as exit_:
+        throughput.main()
+    out, err = capsys.readouterr()
+    assert exit_.value.code == 2 and out == "" and err.count("\n") == 1 and said in err
+    assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("sys.exit('first\\nthe reason')", "ended with status 1: the reason"),
+        ("print('╭─ error ───╮\\n│ no flag x │\\n╰───────────╯', file=sys.stderr); sys.exit(2)", "status 2: no flag x"),
+        ("pass", "logged 0 iterations instead of 33"),
+    ],
+)
+def test_a_process_that_fails_ends_the_call_with_its_last_line(program, said, tmp_path, monkeypatch):
+    script = tmp_path / "script.py"
+    script.write_text(f"import sys\n{program}\n")
+    flags = [str(script), "--env-id", "CartPole-v1", "--jobs", "2", "--csv", str(tmp_path / "throughput.csv")]
+    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags])
+    with pytest.raises(SystemExit) as exit_:
+        throughput.main()
+    assert said in exit_.value.code and "\n" not in exit_.value.code  # a text as exit code is printed, with status 1

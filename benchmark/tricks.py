@@ -1,0 +1,116 @@
+"""What each speed trick of the scripts gains on this machine, alone: its plain form and the trick in turn, A B A B.
+
+    python benchmark/tricks.py --threads 2
+
+Prints a table: milliseconds of each form (median) and the median of the pairwise ratios with its quartiles. Sizes are
+those of the thesis: minibatches of 256 screens for the update, 8 screens for a step of the rollout. Takes two minutes.
+"""
+
+import os
+import time
+from collections.abc import Callable
+from statistics import median, quantiles
+
+if __name__ == "__main__":
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the scripts do, before torch is imported
+
+import torch
+import tyro
+from torch import nn
+from torch.distributions import Categorical
+
+MINIBATCH, NUM_ENVS, NUM_ACTIONS = 256, 8, 6
+
+
+def nature_cnn(convolve_last: bool = False, inplace: bool = True) -> nn.Sequential:
+    """The Nature CNN with a head of logits and a value; the 512-unit layer as a `Linear` or as a 7×7 convolution."""
+    torch.manual_seed(1)
+    wide = [nn.Conv2d(64, 512, 7), nn.Flatten()] if convolve_last else [nn.Flatten(), nn.Linear(3136, 512)]
+    layers = [nn.Conv2d(4, 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3)]
+    layers = [part for layer in layers for part in (layer, nn.ReLU(inplace))]
+    return nn.Sequential(*layers, *wide, nn.ReLU(inplace), nn.Linear(512, NUM_ACTIONS + 1))
+
+
+def update(network: nn.Module, screens: torch.Tensor) -> Callable:
+    def run():
+        network.zero_grad()
+        network(screens.float().div_(255.0)).square().mean().backward()
+
+    return run
+
+
+def optimizer_step(fused: bool) -> Callable:
+    network = nature_cnn()
+    network(torch.rand(2, 4, 84, 84)).sum().backward()
+    return torch.optim.Adam(network.parameters(), lr=1e-9, fused=fused).step
+
+
+def forward(network: nn.Module, screens: torch.Tensor, mode: Callable) -> Callable:
+    def run():
+        with mode():
+            network(screens.float().div_(255.0))
+
+    return run
+
+
+def tricks() -> dict[str, tuple[Callable, Callable]]:
+    """Returns the pairs to compare: what it is, the plain form, the trick."""
+    nhwc = torch.randint(0, 256, (4 * MINIBATCH, 84, 84, 4), dtype=torch.uint8)
+    chosen = torch.randperm(4 * MINIBATCH)[:MINIBATCH]
+    last = nhwc[:MINIBATCH].movedim(-1, 1)  # (B, 4, 84, 84) in channels-last layout
+    first = last.contiguous()  # the same in torch's default layout
+    channels_last = nature_cnn().to(memory_format=torch.channels_last)
+    convolved = nature_cnn(convolve_last=True).to(memory_format=torch.channels_last)
+    out_of_place = nature_cnn(inplace=False).to(memory_format=torch.channels_last)
+    logits = torch.randn(NUM_ENVS, NUM_ACTIONS)
+    return {
+        "update: channels-last layout": (update(nature_cnn(), first), update(channels_last, last)),
+        "update: 512-unit layer as a 7×7 convolution (refused)": (update(channels_last, last), update(convolved, last)),
+        "update: ReLU in place": (update(out_of_place, last), update(channels_last, last)),
+        "update: fused Adam": (optimizer_step(fused=False), optimizer_step(fused=True)),
+        "minibatch: index_select for obs[indices]": (lambda: nhwc[chosen], lambda: nhwc.index_select(0, chosen)),
+        "minibatch: .float().div_(255) for / 255": (lambda: last / 255.0, lambda: last.float().div_(255.0)),
+        "rollout: inference_mode for no_grad": (
+            forward(channels_last, last[:NUM_ENVS], torch.no_grad),
+            forward(channels_last, last[:NUM_ENVS], torch.inference_mode),
+        ),
+        "rollout: multinomial for Categorical": (
+            lambda: Categorical(logits=logits).sample(),
+            lambda: torch.multinomial(logits.log_softmax(-1).exp(), 1).squeeze(-1),
+        ),
+    }
+
+
+def main(threads: int = 2, rounds: int = 15, seconds: float = 0.1) -> None:
+    """Compares every pair.
+
+    Args:
+        threads: torch's threads.
+        rounds: pairs of measurements.
+        seconds: time that one measurement repeats its form for, at least once.
+    """
+    torch.set_num_threads(threads)
+    print(f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, {threads} threads, {rounds} rounds\n")
+    print("| trick | plain, ms | trick, ms | plain / trick (quartiles) |\n|-|-|-|-|")
+    for name, pair in tricks().items():
+        measured = []
+        for _ in range(rounds + 1):
+            measured.append([time_of(form, seconds) for form in pair])
+        plain, trick = zip(*measured[1:])  # the first round warms up
+        ratios = [a / b for a, b in zip(plain, trick)]
+        low, _, high = quantiles(ratios, n=4)
+        times = f"{1e3 * median(plain):.3g} | {1e3 * median(trick):.3g}"
+        print(f"| {name} | {times} | {median(ratios):.2f} ({low:.2f} to {high:.2f}) |", flush=True)
+
+
+def time_of(form: Callable, seconds: float) -> float:
+    """Returns the seconds that one call of `form` takes, averaged over at least `seconds`."""
+    calls, start = 0, time.perf_counter()
+    while time.perf_counter() - start < seconds:
+        form()
+        calls += 1
+    return (time.perf_counter() - start) / calls
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

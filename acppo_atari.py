@@ -289,8 +289,8 @@ def surrogate(ratio: Tensor, advantages: Tensor, clip: Tensor) -> Tensor:
     return torch.min(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
 
 
-def value_loss(new_values: Tensor, values: Tensor, returns: Tensor, vf_clip_coef: float | None) -> Tensor:
-    """Returns half the mean squared error; with `vf_clip_coef`, the larger of it and that of the clipped value."""
+def value_loss(new_values, values, returns, vf_clip_coef: float | None) -> Tensor:
+    """Returns half the mean squared error of values (B,); of each and its clipped form the larger, unless None."""
     squared_error = (new_values - returns).square()
     if vf_clip_coef is not None:
         clipped = values + (new_values - values).clamp(-vf_clip_coef, vf_clip_coef)
@@ -298,7 +298,7 @@ def value_loss(new_values: Tensor, values: Tensor, returns: Tensor, vf_clip_coef
     return 0.5 * squared_error.mean()
 
 
-def policy_change(logprobs: Tensor, new_logprobs: Tensor, actions: Tensor, advantages: Tensor) -> dict[str, Tensor]:
+def policy_change(logprobs, new_logprobs, actions, advantages) -> dict[str, Tensor]:
     """Measures how far an update moved the policy on the B states of its rollout (the README defines each name).
 
     Args: log-probabilities of all actions before and after (B, A), the actions taken (B,), the advantages as the
@@ -385,6 +385,7 @@ class RunDirectory:
                 whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
             state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
             types = {name: type(value) for name, value in state["args"].items()}
+            whole = whole and state["global_step"] >= 0
         except Exception as error:  # whatever a file that is no checkpoint makes them raise
             raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
         expected = {name: type(value) for name, value in saved_args(Args()).items()}
@@ -474,13 +475,31 @@ def train(
     # eps as OpenAI's baselines have it, not torch's 1e-8; fused: one pass over the parameters in place of ten
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
+    # Where the run stands: at its beginning, or at its checkpoint with new games, for the emulators are not kept
+    iteration, global_step, seconds_before = 0, 0, 0.0  # global_step: agent steps, over all environments
+    starts = 0  # so far; each start draws environment seeds of its own
+    last_scores = deque(maxlen=100)  # raw returns of whole games
+    if state is not None:
+        try:
+            agent.load_state_dict(state["agent"])
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
+            iteration, global_step, seconds_before = state["iteration"], state["global_step"], state["seconds"]
+            starts = state["starts"]
+            last_scores.extend(state["last_scores"])
+            torch.set_rng_state(state["rng"])
+            torch.cuda.set_rng_state_all(state["cuda_rng"])
+            run.cut_back(state["event_files"])
+        except Exception as error:  # whatever a checkpoint that someone has written by hand makes them raise
+            refuse("resume", run.path, f"its checkpoint does not fit this script ({type(error).__name__})")
+    tables = {"hyperparameters": vars(args), "provenance": provenance()}
+    run.log([], [(name, markdown_table(rows), global_step) for name, rows in tables.items()])
+
     def from_envs(array: np.ndarray) -> Tensor:
         """(N, 4, 84, 84) → (N, 84, 84, 4); flat observations stay as they are."""
         return torch.from_numpy(array).to(device).movedim(1, -1)
 
     # Storage: T steps of N environments. Row T of `obs` and `values` is where the rollout ends and the next begins.
     T, N = args.num_steps, args.num_envs
-    starts = 0 if state is None else state["starts"]  # each start draws environment seeds of its own
     next_obs, _ = envs.reset(seed=env_seeds(args.seed, N, starts))
     first_obs = from_envs(next_obs)
     obs = torch.zeros((T + 1, *first_obs.shape), dtype=first_obs.dtype, device=device)  # images stay uint8: 4x smaller
@@ -490,30 +509,11 @@ def train(
     rewards = torch.zeros((T, N), device=device)
     terminations = torch.zeros((T, N), dtype=torch.bool, device=device)
     truncations = torch.zeros((T, N), dtype=torch.bool, device=device)
-    final_values = torch.zeros(
-        (T, N), device=device
-    )  # V(the observation it ended on), where truncated; elsewhere stale
+    final_values = torch.zeros((T, N), device=device)  # V(final observation) where truncated; elsewhere stale
     obs[T] = first_obs
 
     # Executables: what runs the network in the loop, compiled or not, under one name
     policy = torch.compile(agent, dynamic=False) if args.compile else agent
-
-    # Where the run stands: at its beginning, or at its checkpoint with new games, for the emulators are not kept
-    iteration, global_step, seconds_before = 0, 0, 0.0  # global_step: agent steps, over all environments
-    last_scores = deque(maxlen=100)  # raw returns of whole games
-    if state is not None:
-        try:
-            agent.load_state_dict(state["agent"])
-            optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
-            iteration, global_step, seconds_before = state["iteration"], state["global_step"], state["seconds"]
-            last_scores.extend(state["last_scores"])
-            torch.set_rng_state(state["rng"])
-            torch.cuda.set_rng_state_all(state["cuda_rng"])
-            run.cut_back(state["event_files"])
-        except Exception as error:  # whatever a checkpoint that someone has written by hand makes them raise
-            refuse("resume", run.path, f"its checkpoint does not fit this script ({type(error).__name__})")
-    tables = {"hyperparameters": vars(args), "provenance": provenance()}
-    run.log([], [(name, markdown_table(rows), global_step) for name, rows in tables.items()])
 
     started = time.perf_counter()
     checkpoint_due = started  # at once, so that there is something to resume from at every moment
@@ -530,20 +530,12 @@ def train(
         finished = iteration >= args.num_iterations or global_step >= (args.stop_at or math.inf)
         finished = finished or (stop is not None and stop.number != 0)
         if finished or time.perf_counter() >= checkpoint_due:
-            run.save(
-                {
-                    "args": saved_args(args),
-                    "agent": agent.state_dict(),
-                    "optimizer": optimizer.state_dict()["state"],
-                    "iteration": iteration,
-                    "global_step": global_step,
-                    "seconds": seconds_before + time.perf_counter() - started,
-                    "last_scores": list(last_scores),
-                    "rng": torch.get_rng_state(),
-                    "cuda_rng": torch.cuda.get_rng_state_all(),
-                    "starts": starts + 1,
-                }
-            )
+            seconds = seconds_before + time.perf_counter() - started
+            where = {"iteration": iteration, "global_step": global_step, "seconds": seconds, "starts": starts + 1}
+            learnt = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"]}
+            randomness = {"rng": torch.get_rng_state(), "cuda_rng": torch.cuda.get_rng_state_all()}
+            scores = {"last_scores": list(last_scores)}
+            run.save({"args": saved_args(args), **where, **learnt, **randomness, **scores})
             checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
         if finished:
             break

@@ -237,10 +237,12 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
         lambda state: {**state, "args": {**state["args"], "learning_rate": "fast"}},
         lambda state: {**state, "agent": {"weight": torch.zeros(2)}},
         lambda state: {name: value for name, value in state.items() if name != "rng"},
+        lambda state: {name: value for name, value in state.items() if name != "starts"},
+        lambda state: {name: value for name, value in state.items() if name != "global_step"},
         lambda state: {},
         lambda state: [1, 2],
     ],
-    ids=["a number as text", "another network", "a part missing", "nothing", "a list"],
+    ids=["a number as text", "another network", "no rng", "no starts", "no global_step", "nothing", "a list"],
 )
 def test_a_checkpoint_changed_by_hand_is_refused_in_one_line(script, finished, change, call_main):
     torch.save(change(checkpoint_of(finished)), finished / "checkpoint.pt")

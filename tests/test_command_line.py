@@ -131,7 +131,7 @@ def test_bad_input_is_refused_in_one_line_and_leaves_nothing(script, flags, name
 
 @pytest.mark.parametrize("c", ["-1", "nan", "-inf", "1e39"])
 def test_a_weight_c_that_is_no_weight_is_refused(c, directory, call_main):
-    check_refusal(call_main(acppo_atari, "--c", c), directory, f"--c {float(c)}", "0 or above")
+    check_refusal(call_main(acppo_atari, f"--c={c}"), directory, f"--c {float(c)}", "0 or above")
 
 
 def test_a_refusal_is_status_two_and_one_line_from_the_process_too(script, tmp_path):

@@ -6,10 +6,10 @@ What differs from ppo_atari.py is this text, the arguments clip_coef and c with 
     python acppo_atari.py --env-id Breakout --c 1.0
     tensorboard --logdir runs
 
-8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (README: speed). Scores, losses and
-how far each update moved the policy go to TensorBoard, the README defines every curve; on Breakout the score leaves 2
-after some 50,000 steps. A stopped or killed run goes on with `--resume`. The two scripts are siblings: their diff is
-the whole of AC-PPO, and a change to one is a change to both.
+8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (the README has the speed and what
+Breakout scores on the way). Scores, losses and how far each update moved the policy go to TensorBoard; the README
+defines every curve. A stopped or killed run goes on with `--resume`. The two scripts are siblings: their diff is the
+whole of AC-PPO, and a change to one is a change to both.
 
 Sections: arguments, network, mathematics, run directory, training, command line.
 """

@@ -4,10 +4,10 @@ The clipped surrogate (2.14), generalised advantages (2.5), a clipped value loss
     python ppo_atari.py --env-id Breakout
     tensorboard --logdir runs
 
-8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (README: speed). Scores, losses and
-how far each update moved the policy go to TensorBoard, the README defines every curve; on Breakout the score leaves 2
-after some 50,000 steps. A stopped or killed run goes on with `--resume`. The two scripts are siblings: their diff is
-the whole of AC-PPO, and a change to one is a change to both.
+8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (the README has the speed and what
+Breakout scores on the way). Scores, losses and how far each update moved the policy go to TensorBoard; the README
+defines every curve. A stopped or killed run goes on with `--resume`. The two scripts are siblings: their diff is the
+whole of AC-PPO, and a change to one is a change to both.
 
 Sections: arguments, network, mathematics, run directory, training, command line.
 """

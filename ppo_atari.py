@@ -12,6 +12,7 @@ whole of AC-PPO, and a change to one is a change to both.
 Sections: arguments, network, mathematics, run directory, training, command line.
 """
 
+import contextlib
 import ctypes
 import fcntl
 import importlib.metadata
@@ -345,25 +346,30 @@ class RunDirectory:
                     self.writer.add_scalar(*point)
                 self.writer.flush()
         except OSError as error:
+            self.writer, self.waiting = None, True  # its thread has died of it; there is a successor after a checkpoint
             self.report(error)
 
     def save(self, state: dict) -> None:
         """Writes a checkpoint beside the last one and renames it over: at every instant one of the two is whole."""
+        new = self.checkpoint + ".new"
         try:
-            with open(self.checkpoint + ".new", "wb") as file:
+            with open(new, "wb") as file:
                 torch.save({**state, "event_files": self.event_files()}, file)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(self.checkpoint + ".new", self.checkpoint)
+            for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
+                with open(name, "rb+") as file:  # on the disk before the rename is, also if the power fails
+                    os.fsync(file.fileno())
+            os.replace(new, self.checkpoint)
+            os.fsync(self.lock)
             self.waiting = False
         except (OSError, RuntimeError) as error:  # torch raises the latter where the file raised the former
             self.report(error)
+            with contextlib.suppress(OSError):
+                os.remove(new)  # half of it would fill the disk further
 
     def report(self, error: Exception) -> None:
-        """Says once that something cannot be written. TensorBoard's thread has died of it and needs a successor."""
         if not self.failed:
-            print(f"{self.path}: {error}; training goes on, what cannot be written is lost", file=sys.stderr)
-        self.failed, self.waiting, self.writer = True, True, None
+            say(f"{self.path}: {error}; training goes on, what cannot be written is lost")
+        self.failed = True
 
     def load(self) -> dict:
         """Returns the checkpoint. Raises ValueError where there is none, or none that this script has written."""
@@ -373,12 +379,15 @@ class RunDirectory:
             with zipfile.ZipFile(self.checkpoint) as archive:
                 whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
             state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
-            types = {name: type(value) for name, value in state["args"].items()}
-            whole = whole and state["global_step"] >= 0
+            args = state["args"]
+            types = {name: type(value) for name, value in args.items() if value is not None}
+            whole &= {type(state[name]) for name in ("iteration", "global_step", "starts")} == {int}
+            whole &= {float} == {type(number) for number in (state["seconds"], *state["last_scores"])}
+            whole &= state["global_step"] == state["iteration"] * args["num_envs"] * args["num_steps"]
         except Exception as error:  # whatever a file that is no checkpoint makes them raise
             raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
-        expected = {name: type(value) for name, value in saved_args(Args()).items()}
-        if not whole or {**types, "target_kl": None} != {**expected, "target_kl": None}:
+        expected = {name: type(value) for name, value in saved_args(Args(target_kl=0.1)).items()}
+        if not whole or args.keys() != expected.keys() or {**expected, **types} != expected:
             raise ValueError("its checkpoint is damaged, or of another script")
         return state
 
@@ -404,7 +413,13 @@ class StopSignal:
         self.number = number
         for again in (signal.SIGINT, signal.SIGTERM):
             signal.signal(again, signal.SIG_DFL)
-        print("\nStopping after this iteration, with a checkpoint; once more ends at once", file=sys.stderr)
+        say("\nStopping after this iteration, with a checkpoint; once more ends at once")
+
+
+def say(line: str) -> None:
+    """Writes to standard error, whatever has become of it: the end of a pipe or a full disk must not end the run."""
+    with contextlib.suppress(OSError):
+        os.write(2, f"{line}\n".encode())
 
 
 def saved_args(args: Args) -> dict[str, object]:
@@ -476,7 +491,8 @@ def train(
             starts = state["starts"]
             last_scores.extend(state["last_scores"])
             torch.set_rng_state(state["rng"])
-            torch.cuda.set_rng_state_all(state["cuda_rng"])
+            if device.type == "cuda" and state["cuda_rng"]:
+                torch.cuda.set_rng_state(state["cuda_rng"][0])
             run.cut_back(state["event_files"])
         except Exception as error:  # whatever a checkpoint that someone has written by hand makes them raise
             refuse("resume", run.path, f"its checkpoint does not fit this script ({type(error).__name__})")
@@ -517,12 +533,15 @@ def train(
     while True:
         # Checkpoint: when due, and at the end
         finished = iteration >= args.num_iterations or global_step >= (args.stop_at or math.inf)
+        if stop is not None and finished:
+            stop.number = 0  # a signal now comes too late to stop anything
         finished = finished or (stop is not None and stop.number != 0)
         if finished or time.perf_counter() >= checkpoint_due:
             seconds = seconds_before + time.perf_counter() - started
             where = {"iteration": iteration, "global_step": global_step, "seconds": seconds, "starts": starts + 1}
             learnt = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"]}
-            randomness = {"rng": torch.get_rng_state(), "cuda_rng": torch.cuda.get_rng_state_all()}
+            cuda_rng = [torch.cuda.get_rng_state()] if device.type == "cuda" else []
+            randomness = {"rng": torch.get_rng_state(), "cuda_rng": cuda_rng}
             scores = {"last_scores": list(last_scores)}
             run.save({"args": saved_args(args), **where, **learnt, **randomness, **scores})
             checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
@@ -651,8 +670,8 @@ def train(
 # ------------------------------------------------------------------------------------------------- command line
 def main() -> None:
     # TensorBoard's thread prints a traceback when the disk is full; RunDirectory says it in one line
-    threading.excepthook = lambda failure: None
-    args, state = tyro.cli(Args), None
+    threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
+    args, state, stop = tyro.cli(Args), None, StopSignal()
     if args.resume is not None:
         try:
             run = RunDirectory(args.resume)
@@ -669,7 +688,8 @@ def main() -> None:
     if state is not None and state["global_step"] >= min(
         args.num_iterations * args.batch_size, args.stop_at or math.inf
     ):
-        print(f"{args.resume} has finished at step {state['global_step']}; a larger --total-timesteps takes it further")
+        limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
+        print(f"{args.resume} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")
         return
     try:
         envs = make_envs(args.env_id, args.num_envs, num_threads=args.threads)
@@ -680,12 +700,12 @@ def main() -> None:
             run = RunDirectory(make_run_dir(args))  # last, so that nothing refused above leaves one behind
         except OSError as error:
             refuse("log_dir", args.log_dir, f"cannot be written ({error.strerror}); give another directory")
-    stop = StopSignal()
     train(args, envs, run, state, stop)
+    if run.failed:
+        sys.exit(1)
     if stop.number:
-        print(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path])}", file=sys.stderr)
+        say(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path])}")
         sys.exit(128 + stop.number)
-    sys.exit(1 if run.failed else 0)
 
 
 if __name__ == "__main__":

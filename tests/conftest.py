@@ -1,6 +1,7 @@
 """What several test files share: the scripts, names of tiny environments, and what a run has logged."""
 
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -61,8 +62,14 @@ def call_main(monkeypatch, capsys):
     def call(script, *flags: str) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", [script.__file__, *flags])
         monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # which main replaces
-        with pytest.raises(SystemExit) as ended:
+        handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
             script.main()
-        return ended.value.code, *capsys.readouterr()
+            status = 0
+        except SystemExit as ended:
+            status = ended.code
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+        return status, *capsys.readouterr()
 
     return call

@@ -68,11 +68,11 @@ def test_stopped_and_resumed_logs_what_straight_through_logs(script, env_id, tmp
 def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     """Resumed at the step where it stops, a run writes the checkpoint that it has read."""
     args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=384, **SMALL)
-    script.train(args, make_envs("CartPole-v1", 4), script.RunDirectory(str(tmp_path)))
+    run = script.RunDirectory(str(tmp_path))
+    script.train(args, make_envs("CartPole-v1", 4), run)
     before = checkpoint_of(tmp_path)
-    run = script.RunDirectory.__new__(script.RunDirectory)  # the first one holds the lock of this process
-    vars(run).update(path=str(tmp_path), checkpoint=str(tmp_path / "checkpoint.pt"), writer=None)
-    vars(run).update(failed=False, waiting=False)
+    os.close(run.lock)
+    run = script.RunDirectory(str(tmp_path))
     script.train(args, make_envs("CartPole-v1", 4), run, run.load())
     after = checkpoint_of(tmp_path)
     assert before["optimizer"].keys() == after["optimizer"].keys() and len(before["optimizer"]) > 0
@@ -94,15 +94,16 @@ def killed_and_resumed(script, tmp_path, kills: int, seed: int) -> dict:
     moments = random.Random(seed)
     flags = flags_of(env_id="CartPole-v1", total_timesteps=128_000, checkpoint_minutes=0, **SMALL)
     command, saved = [sys.executable, script.__file__, *flags], 0
-    for _ in range(kills):
+    for kill in range(kills):
         process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True)
         while not (tmp_path / "runs").exists() or not list((tmp_path / "runs").glob("*/checkpoint.pt")):
             time.sleep(0.01)
         run_dir = run_dir_in(tmp_path)
         begun = checkpoint_of(run_dir)["starts"]
-        while checkpoint_of(run_dir)["starts"] == begun and command[2] == "--resume" and process.poll() is None:
-            time.sleep(0.01)
-        time.sleep(moments.uniform(0, 0.3))
+        if kill % 2 == 0:  # every other kill comes at any moment from the start of the process on
+            while checkpoint_of(run_dir)["starts"] == begun and command[2] == "--resume" and process.poll() is None:
+                time.sleep(0.01)
+        time.sleep(moments.uniform(0, 0.3 if kill % 2 == 0 else 4))
         process.kill()
         assert process.communicate()[1] == "" and process.returncode == -signal.SIGKILL
         state = checkpoint_of(run_dir)
@@ -159,7 +160,11 @@ def finished(script, finished_runs, tmp_path) -> Path:
 
 def test_a_finished_run_says_so_and_goes_on_with_more_steps(script, finished, tmp_path):
     again = run_script(script, "--resume", str(finished), cwd=tmp_path)
-    assert again.returncode == 0 and "has finished at step 256" in again.stdout and again.stderr == ""
+    assert (
+        again.returncode == 0
+        and "is finished up to --total-timesteps, at step 256" in again.stdout
+        and again.stderr == ""
+    )
     longer = run_script(script, "--resume", str(finished), "--total-timesteps", "512", cwd=tmp_path)
     assert (longer.returncode, longer.stderr) == (0, "")
     assert scalars(finished)[EVERY_ITERATION] == [
@@ -239,10 +244,28 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
         lambda state: {name: value for name, value in state.items() if name != "rng"},
         lambda state: {name: value for name, value in state.items() if name != "starts"},
         lambda state: {name: value for name, value in state.items() if name != "global_step"},
+        lambda state: {**state, "args": {**state["args"], "target_kl": "fast"}},
+        lambda state: {**state, "iteration": "1"},
+        lambda state: {**state, "iteration": 1},
+        lambda state: {**state, "seconds": "x"},
+        lambda state: {**state, "last_scores": ["a"]},
         lambda state: {},
         lambda state: [1, 2],
     ],
-    ids=["a number as text", "another network", "no rng", "no starts", "no global_step", "nothing", "a list"],
+    ids=[
+        "a number as text",
+        "another network",
+        "no rng",
+        "no starts",
+        "no global_step",
+        "target_kl",
+        "text for a number",
+        "another step",
+        "seconds",
+        "scores",
+        "nothing",
+        "a list",
+    ],
 )
 def test_a_checkpoint_changed_by_hand_is_refused_in_one_line(script, finished, change, call_main):
     torch.save(change(checkpoint_of(finished)), finished / "checkpoint.pt")
@@ -315,10 +338,17 @@ def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, wh
     assert all(value.isfinite().all() for value in state["agent"].values())
 
 
-@pytest.mark.parametrize("bytes_allowed", [pytest.param(40_000, marks=pytest.mark.slow), 120_000])
-def test_a_full_disk_is_said_once_and_training_goes_on(script, bytes_allowed, tmp_path):
-    """No file may grow beyond the limit: the event file (40 kB) or neither it nor the checkpoint can be written."""
-    flags = flags_of(env_id="CartPole-v1", total_timesteps=25_600, checkpoint_minutes=0, **SMALL)
+@pytest.mark.parametrize(
+    ("bytes_allowed", "total", "last_saved"),
+    [
+        pytest.param(40_000, 2560, None, marks=pytest.mark.slow),  # no checkpoint, ever
+        (120_000, 7680, 0),  # no checkpoint with Adam's moments
+        pytest.param(160_000, 128_000, 128_000, marks=pytest.mark.slow),  # an event file grows too large
+    ],
+)
+def test_a_full_disk_is_said_once_and_training_goes_on(script, bytes_allowed, total, last_saved, tmp_path):
+    """No file may grow beyond the limit, which is what the disk says when it is full."""
+    flags = flags_of(env_id="CartPole-v1", total_timesteps=total, checkpoint_minutes=0.01, **SMALL)
     run = subprocess.run(
         [sys.executable, script.__file__, *flags],
         cwd=tmp_path,
@@ -328,6 +358,18 @@ def test_a_full_disk_is_said_once_and_training_goes_on(script, bytes_allowed, tm
     )
     assert run.returncode == 1
     assert run.stderr.count("\n") == 1 and "training goes on" in run.stderr
+    run_dir = run_dir_in(tmp_path)
+    assert not (run_dir / "checkpoint.pt.new").exists()
+    if last_saved is None:
+        assert not (run_dir / "checkpoint.pt").exists()
+    else:
+        assert checkpoint_of(run_dir)["global_step"] == last_saved
+    steps = [step for step, _ in scalars(run_dir)[EVERY_ITERATION]]
+    assert steps == sorted(set(steps))
+    if last_saved == total:  # the event file has a successor, which got the last points
+        assert len(list(run_dir.glob("events.*"))) > 1 and steps[-1] > total - 64 * 128
+    else:
+        assert steps[-1] == total
 
 
 def test_the_last_checkpoint_is_enough_to_play(script, finished):
@@ -371,7 +413,7 @@ COMMAND_LINES = st.fixed_dictionaries(
 
 
 @pytest.mark.slow
-def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, capsys, monkeypatch):
+def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, monkeypatch, call_main):
     """300 command lines, sensible and not, through `main` in this process; none may end in a traceback."""
     outcomes = Counter()
 
@@ -383,14 +425,7 @@ def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, c
         (directory / "taken").write_text("a file")
         monkeypatch.chdir(directory)
         arguments = {"env_id": "CartPole-v1", "threads": 1, **arguments}
-        monkeypatch.setattr(
-            sys, "argv", [script.__file__, *(f"--{k.replace('_', '-')}={v}" for k, v in arguments.items())]
-        )
-        capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            script.main()
-        out, err = capsys.readouterr()
-        status = ended.value.code
+        status, out, err = call_main(script, *(f"--{k.replace('_', '-')}={v}" for k, v in arguments.items()))
         assert "Traceback" not in out + err
         if status == 2:
             assert err.count("\n") == 1 or "╭" in err

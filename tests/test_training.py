@@ -15,7 +15,7 @@ from wrappers import env_seeds, make_envs
 # Small rollouts of each kind: agent steps, environments and steps of a rollout
 SMALL = {"num_envs": 4, "num_steps": 32, "total_timesteps": 256}
 CARTPOLE = {"env_id": "CartPole-v1", **SMALL}
-BREAKOUT = {"env_id": "Breakout", **SMALL}
+BREAKOUT = {"env_id": "Breakout", **SMALL, "num_envs": 2, "total_timesteps": 128}
 PIXELS = {"env_id": TINY_PIXELS, **SMALL}
 
 
@@ -226,7 +226,7 @@ def test_rewards_and_scores_are_those_of_the_environments(script, tmp_path, monk
 
 
 def test_speed_and_phases_add_up_to_the_time_that_passed(script, tmp_path):
-    logged = train(script, tmp_path, **{**BREAKOUT, "total_timesteps": 128})
+    logged = train(script, tmp_path, **{**BREAKOUT, "num_envs": 4, "total_timesteps": 128})
     phases = sum(values(logged, tag)[0] for tag in logged if tag.startswith("time/"))
     assert 0.8 < phases * values(logged, "charts/SPS")[0] / 128 < 1.2
 

@@ -11,28 +11,23 @@ Breakout scores on the way). Scores, losses and how far each update moved the po
 defines every curve. A stopped or killed run goes on with `--resume`. The two scripts are siblings: their diff is the
 whole of AC-PPO, and a change to one is a change to both.
 
-Sections: arguments, network, mathematics, run directory, training, command line.
+Sections: arguments, network, mathematics, playing, training, command line.
 """
 
-import contextlib
+import csv
 import ctypes
-import fcntl
-import importlib.metadata
 import math
 import os
-import platform
 import re
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import threading
 import time
-import zipfile
 from collections import deque
 from dataclasses import dataclass, field, replace
-from typing import NoReturn
+from datetime import timedelta
 
 if __name__ == "__main__":  # here alone: importing this file leaves the importer's process as it is
     # Idle OpenMP threads would spin on the cores that the games' threads need. torch reads this when it is imported.
@@ -48,10 +43,8 @@ import torch
 import tyro
 from gymnasium.vector import VectorEnv
 from torch import Tensor, nn
-from torch.utils.tensorboard import SummaryWriter
-from tqdm import tqdm
 
-from wrappers import env_seeds, make_envs
+from wrappers import RunDirectory, StatusLine, StopSignal, Stopwatch, available_cores, env_seeds, make_envs, refuse, say
 
 
 # ---------------------------------------------------------------------------------------------------- arguments
@@ -120,6 +113,12 @@ class Args:
     """directory that the run's own directory is made in"""
     checkpoint_minutes: float = 5.0
     """wall time between two checkpoints; 0 writes one after every iteration"""
+    eval_episodes: int = 10
+    """whole games that are played and scored when the training is finished, without learning; 0 for none"""
+    capture_video: bool = False
+    """record a whole game at the start, at each quarter of the training and at its end, in `videos/` of the run"""
+    evaluate: str | None = None
+    """directory of a run whose checkpoint is to play `--eval-episodes` games; nothing is trained"""
     resume: str | None = None
     """directory of a run to go on with, under its own arguments; a flag given beside this one replaces the run's"""
     stop_at: int | None = None
@@ -139,50 +138,39 @@ class Args:
         """Rollouts with their updates in the whole run."""
         return self.total_timesteps // self.batch_size
 
+    @property
+    def last_iteration(self) -> int:
+        """The iteration that this call ends with."""
+        most = self.num_iterations if self.stop_at is None else -(-self.stop_at // self.batch_size)  # rounded up
+        return min(self.num_iterations, most)
+
     def check(self) -> None:
         """Ends the program with status 2 at the first argument that cannot work."""
-
-        def require(fits: bool, name: str, advice: str) -> None:
-            if not fits:
-                refuse(name, getattr(self, name), advice)
-
-        for name in ("total_timesteps", "num_envs", "num_steps", "num_minibatches", "update_epochs"):
-            require(getattr(self, name) > 0, name, "give a whole number above 0")
-        for name in ("learning_rate", "clip_coef", "vf_clip_coef", "max_grad_norm"):  # 1e30: float32 must hold them
-            require(0 < getattr(self, name) < 1e30, name, "give a finite number above 0")
-        for name in ("ent_coef", "vf_coef", "checkpoint_minutes"):
-            require(0 <= getattr(self, name) < 1e30, name, "give a finite number, 0 or above")
-        require(0 <= self.c < 1e30 or self.c == math.inf, "c", "give a number, 0 or above, or inf")
-        for name in ("gamma", "gae_lambda"):
-            require(0 <= getattr(self, name) <= 1, name, "give a number from 0 to 1")
-        for name in ("target_kl", "stop_at"):
-            require(getattr(self, name) is None or getattr(self, name) > 0, name, "give a number above 0, or None")
-        require(0 <= self.seed < 2**64, "seed", "give a whole number from 0 to 2^64 - 1")
-        most_threads = 4 * available_cores()
-        require(0 < self.threads <= most_threads, "threads", f"give a number from 1 to {most_threads}")
-        names_a_directory = re.fullmatch(r"[\w.-]{1,100}", self.exp_name)
-        require(names_a_directory, "exp_name", "it names a directory: give up to 100 of letters, digits, '.', '_', '-'")
-        compiler = os.environ.get("CXX", "g++")
-        require(not self.compile or shutil.which(compiler), "compile", f"there is no C++ compiler {compiler}")
+        most_threads, compiler = 4 * available_cores(), os.environ.get("CXX", "g++")
         rollout = f"num_envs · num_steps = {self.batch_size}"
-        require(
-            self.batch_size <= 1_000_000, "num_steps", f"give a rollout of at most 1,000,000 samples, not {rollout}"
-        )
-        require(self.total_timesteps >= self.batch_size, "total_timesteps", f"give at least one rollout, {rollout}")
-        require(self.batch_size % self.num_minibatches == 0, "num_minibatches", f"give a divisor of {rollout}")
-        alone = self.norm_adv and self.minibatch_size == 1
-        require(not alone, "num_minibatches", "one sample cannot be normalised: give fewer, or --no-norm-adv")
-
-
-def available_cores() -> int:
-    """Returns the number of cores this process may run on: its affinity, where the system has one."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def refuse(name: str, given: object, advice: object) -> NoReturn:
-    """Ends the program with status 2 and one line: the flag, what was given to it, and what to do."""
-    print(" ".join(f"--{name.replace('_', '-')} {given}: {advice}".split()), file=sys.stderr)
-    sys.exit(2)
+        sizes = "total_timesteps num_envs num_steps num_minibatches update_epochs"
+        rules = [  # 1e30: float32 must hold what is computed with it
+            (sizes, lambda x: x > 0, "give a whole number above 0"),
+            ("learning_rate clip_coef vf_clip_coef max_grad_norm", lambda x: 0 < x < 1e30, "give a finite one above 0"),
+            ("ent_coef vf_coef checkpoint_minutes eval_episodes", lambda x: 0 <= x < 1e30, "give a finite 0 or above"),
+            ("c", lambda x: 0 <= x < 1e30 or x == math.inf, "give a number, 0 or above, or inf"),
+            ("gamma gae_lambda", lambda x: 0 <= x <= 1, "give a number from 0 to 1"),
+            ("target_kl stop_at", lambda x: x is None or x > 0, "give a number above 0, or None"),
+            ("seed", lambda x: 0 <= x < 2**64, "give a whole number from 0 to 2^64 - 1"),
+            ("threads", lambda x: 0 < x <= most_threads, f"give a number from 1 to {most_threads}"),
+            ("exp_name", lambda x: re.fullmatch(r"[\w.-]{1,100}", x), "give up to 100 letters, digits, '.', '_', '-'"),
+            ("compile", lambda x: not x or shutil.which(compiler), f"there is no C++ compiler {compiler}"),
+            ("num_steps", lambda x: self.batch_size <= 1_000_000, "give at most 1,000,000 samples a rollout"),
+            ("total_timesteps", lambda x: x >= self.batch_size, f"give at least one rollout, {rollout}"),
+            ("num_minibatches", lambda x: self.batch_size % x == 0, f"give a divisor of {rollout}"),
+            ("num_minibatches", lambda x: x < self.batch_size or not self.norm_adv, "one sample cannot be normalised"),
+            ("evaluate", lambda x: x is None or self.eval_episodes > 0, "give --eval-episodes above 0, too"),
+            ("evaluate", lambda x: x is None or self.resume is None, "give either this or --resume"),
+        ]
+        for names, works, advice in rules:
+            for name in names.split():
+                if not works(getattr(self, name)):
+                    refuse(name, getattr(self, name), advice)
 
 
 # ------------------------------------------------------------------------------------------------------ network
@@ -239,12 +227,17 @@ def tanh_mlp(num_inputs: int, num_outputs: int, gain: float) -> nn.Module:
     )
 
 
+def from_envs(array: np.ndarray, device: torch.device) -> Tensor:
+    """Moves observations to the network: screens (N, 4, 84, 84) → (N, 84, 84, 4); flat ones stay as they are."""
+    return torch.from_numpy(array).to(device).movedim(1, -1)
+
+
 @torch.inference_mode()
-def act(agent: nn.Module, obs: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def act(agent: nn.Module, obs: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Samples actions (B,) and returns them with the log-probabilities of all actions (B, A) and the values (B,)."""
     logits, values = agent(obs)
     logprobs = logits.log_softmax(-1)  # by hand: a validated Categorical takes 1.8 times as long
-    return torch.multinomial(logprobs.exp(), 1).squeeze(-1), logprobs, values
+    return torch.multinomial(logprobs.exp(), 1, generator=generator).squeeze(-1), logprobs, values
 
 
 @torch.inference_mode()
@@ -319,156 +312,58 @@ def policy_change(logprobs, new_logprobs, actions, advantages) -> dict[str, Tens
     }
 
 
-# ------------------------------------------------------------------------------------------------ run directory
-def make_run_dir(args: Args) -> str:
-    """Makes the run's own directory and returns its path; a name that is taken moves on to the next second."""
-    os.makedirs(args.log_dir, exist_ok=True)
-    started = int(time.time())
-    while True:
-        name = re.sub(r"[^\w.-]", "-", args.env_id)
-        path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{started}")
-        try:
-            os.mkdir(path)
-            return path
-        except FileExistsError:
-            started += 1
+# ------------------------------------------------------------------------------------------------------ playing
+def make_agent(args: Args, envs: VectorEnv) -> tuple[Agent, torch.device]:
+    """Builds the network that fits the environment's spaces, on the device that it is used on."""
+    device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
+    agent = Agent(envs.single_observation_space.shape, int(envs.single_action_space.n), args.bf16)
+    return agent.to(device, memory_format=torch.channels_last), device
 
 
-class RunDirectory:
-    """A run's event files and its checkpoint, held by one process at a time; a full disk costs points, not the run."""
+def play(agent: Agent, envs: VectorEnv, num_games: int, seed: list[int]) -> list[tuple[float, int]]:
+    """Plays whole games as in training, actions drawn from the policy, and returns (score, agent steps) of each.
 
-    def __init__(self, path: str):
-        """Opens an existing directory. Raises OSError; BlockingIOError where another process holds it."""
-        self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
-        self.lock = os.open(path, os.O_RDONLY)
-        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
-        self.writer = None
-        self.failed = False  # has anything not been written?
-        self.waiting = False  # for the next checkpoint to succeed, before more is logged?
-
-    def log(self, points: list[tuple], texts: list[tuple] = ()) -> None:
-        """Writes (tag, value, agent step) to TensorBoard."""
-        try:
-            if not self.waiting:
-                self.writer = self.writer or SummaryWriter(self.path)
-                for text in texts:
-                    self.writer.add_text(*text)
-                for point in points:
-                    self.writer.add_scalar(*point)
-                self.writer.flush()
-        except OSError as error:
-            self.writer, self.waiting = None, True  # its thread has died of it; there is a successor after a checkpoint
-            self.report(error)
-
-    def save(self, state: dict) -> None:
-        """Writes a checkpoint beside the last one and renames it over: at every instant one of the two is whole."""
-        new = self.checkpoint + ".new"
-        try:
-            with open(new, "wb") as file:
-                torch.save({**state, "event_files": self.event_files()}, file)
-            for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
-                with open(name, "rb+") as file:  # on the disk before the rename is, also if the power fails
-                    os.fsync(file.fileno())
-            os.replace(new, self.checkpoint)
-            os.fsync(self.lock)
-            self.waiting = False
-        except (OSError, RuntimeError) as error:  # torch raises the latter where the file raised the former
-            self.report(error)
-            with contextlib.suppress(OSError):
-                os.remove(new)  # half of it would fill the disk further
-
-    def report(self, error: Exception) -> None:
-        if not self.failed:
-            say(f"{self.path}: {error}; training goes on, what cannot be written is lost")
-        self.failed = True
-
-    def load(self) -> dict:
-        """Returns the checkpoint. Raises ValueError where there is none, or none that this script has written."""
-        if not os.path.exists(self.checkpoint):
-            raise ValueError("it holds no checkpoint; start the run anew")
-        try:
-            with zipfile.ZipFile(self.checkpoint) as archive:
-                whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
-            state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
-            args = state["args"]
-            types = {name: type(value) for name, value in args.items() if value is not None}
-            whole &= {type(state[name]) for name in ("iteration", "global_step", "starts")} == {int}
-            whole &= {float} == {type(number) for number in (state["seconds"], *state["last_scores"])}
-            whole &= state["global_step"] == state["iteration"] * args["num_envs"] * args["num_steps"]
-        except Exception as error:  # whatever a file that is no checkpoint makes them raise
-            raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
-        expected = {name: type(value) for name, value in saved_args(Args(target_kl=0.1)).items()}
-        if not whole or args.keys() != expected.keys() or {**expected, **types} != expected:
-            raise ValueError("its checkpoint is damaged, or of another script")
-        return state
-
-    def event_files(self) -> dict[str, int]:
-        """Returns the size in bytes of each event file, by name."""
-        return {file.name: file.stat().st_size for file in os.scandir(self.path) if file.name.startswith("events.")}
-
-    def cut_back(self, event_files: dict[str, int]) -> None:
-        """Takes out of the event files what was logged after the checkpoint, for every reader of them."""
-        for name, size in self.event_files().items():
-            os.truncate(os.path.join(self.path, name), min(size, event_files.get(name, 0)))
+    Each environment plays a fixed share of them: of those that end first, too many would be short. All that is random
+    comes from `seed`, so that a training is not disturbed.
+    """
+    device = next(agent.parameters()).device
+    generator = torch.Generator(device).manual_seed(seed[0])
+    obs, _ = envs.reset(seed=env_seeds(seed, envs.num_envs))
+    games = [[] for _ in range(envs.num_envs)]
+    shares = [len(range(n, num_games, envs.num_envs)) for n in range(envs.num_envs)]
+    while any(len(played) < share for played, share in zip(games, shares, strict=True)):
+        actions, _, _ = act(agent, from_envs(obs, device), generator)
+        obs, _, _, _, infos = envs.step(actions.cpu().numpy())
+        for n in np.flatnonzero(infos.get("_episode", False)):
+            games[n].append((float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
+    return [game for played, share in zip(games, shares, strict=True) for game in played[:share]]
 
 
-class StopSignal:
-    """Notes the first SIGINT or SIGTERM in `number`, for a clean end; a second ends the process at once."""
-
-    def __init__(self):
-        self.number = 0
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self.note)
-
-    def note(self, number: int, frame: object) -> None:
-        self.number = number
-        for again in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(again, signal.SIG_DFL)
-        say("\nStopping after this iteration, with a checkpoint; once more ends at once")
-
-
-def say(line: str) -> None:
-    """Writes to standard error, whatever has become of it: the end of a pipe or a full disk must not end the run."""
-    with contextlib.suppress(OSError):
-        os.write(2, f"{line}\n".encode())
+def evaluate(args: Args, agent: Agent, run: RunDirectory, state: dict) -> None:
+    """Has the agent of a checkpoint play `args.eval_episodes` games, for the terminal, TensorBoard and `eval.csv`."""
+    torch.set_num_threads(args.threads)
+    envs = make_envs(args.env_id, min(args.num_envs, args.eval_episodes), args.threads)
+    games = play(agent, envs, args.eval_episodes, seed=[args.seed, 1])
+    scores = np.array([score for score, _ in games])
+    std = scores.std(ddof=1) if len(scores) > 1 else 0.0
+    stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
+    run.log([(f"eval/{name}", value, state["global_step"]) for name, value in stats.items()])
+    with run.reporting(), open(os.path.join(run.path, "eval.csv"), "a", newline="") as file:
+        rows = [(state["global_step"], number, *game) for number, game in enumerate(games, start=1)]
+        csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
+    run.save(state, Args(**state["args"]))  # so that a resumed run keeps these points
+    print(f"{len(games)} games at step {state['global_step']:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
 
 
-def saved_args(args: Args) -> dict[str, object]:
-    """Returns the arguments that belong to the run, not to one call of it."""
-    return {name: value for name, value in vars(args).items() if name not in ("resume", "stop_at")}
-
-
-def provenance() -> dict[str, object]:
-    """Returns what a reader needs to repeat a run besides its arguments: versions, commit, machine, threads."""
-    packages = ["torch", "gymnasium", "ale-py", "numpy", "opencv-python-headless", "tensorboard", "tyro"]
-    git = ["git", "-C", os.path.dirname(os.path.abspath(__file__)), "describe", "--always", "--dirty", "--abbrev=40"]
-    git += ["--exclude=*"]  # no tags: the commit itself
-    try:
-        commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "not a git checkout"
-    versions = {package: importlib.metadata.version(package) for package in packages}
-    machine = f"{platform.platform()}, {available_cores()} cores, {torch.backends.cpu.get_cpu_capability()}"
-    threads = f"{torch.get_num_threads()} torch, OMP_WAIT_POLICY {os.environ.get('OMP_WAIT_POLICY', 'not set')}"
-    return {"commit": commit, "python": platform.python_version(), **versions, "machine": machine, "threads": threads}
-
-
-def markdown_table(rows: dict[str, object]) -> str:
-    return "\n".join(["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())])
-
-
-class Stopwatch:
-    """Adds up the seconds spent in each phase of an iteration (a GPU's work counts where it is waited for)."""
-
-    def __init__(self):
-        self.seconds: dict[str, float] = {}
-        self.last = time.perf_counter()
-
-    def lap(self, phase: str) -> None:
-        """Counts the time since the last lap as `phase`."""
-        now = time.perf_counter()
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self.last
-        self.last = now
+def record_game(args: Args, agent: Agent, run: RunDirectory, global_step: int) -> None:
+    """Plays one game into `videos/` of the run, with its score in the file's name."""
+    path = os.path.join(run.path, "videos", f"step_{global_step}")
+    with run.reporting():
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        envs = make_envs(args.env_id, 1, args.threads, video=path + ".webm")
+        ((score, _),) = play(agent, envs, 1, seed=[args.seed, 2])
+        envs.close()
+        os.replace(path + ".webm", f"{path}_score_{score:.10g}.webm")
 
 
 # ----------------------------------------------------------------------------------------------------- training
@@ -480,13 +375,11 @@ def train(
     Ends early at `args.stop_at` or when `stop` has noted a signal, and with status 1 at a number that is not finite.
     """
     # Setup
+    stop = stop or StopSignal()  # one that listens to nothing
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(args.threads)
-    device = torch.device("cuda" if args.cuda and torch.cuda.is_available() else "cpu")
-    num_actions = int(envs.single_action_space.n)
-    agent = Agent(envs.single_observation_space.shape, num_actions, args.bf16)
-    agent.to(device, memory_format=torch.channels_last)
+    agent, device = make_agent(args, envs)
     # eps as OpenAI's baselines have it, not torch's 1e-8; fused: 1.3 ms a step, not 5.7 (benchmark/tricks.py)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
@@ -495,32 +388,26 @@ def train(
     starts = 0  # so far; each start draws environment seeds of its own
     last_scores = deque(maxlen=100)  # raw returns of whole games
     if state is not None:
-        try:
+        with run.loading():
             agent.load_state_dict(state["agent"])
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
             iteration, global_step, seconds_before = state["iteration"], state["global_step"], state["seconds"]
             starts = state["starts"]
             last_scores.extend(state["last_scores"])
-            torch.set_rng_state(state["rng"])
-            if device.type == "cuda" and state["cuda_rng"]:
-                torch.cuda.set_rng_state(state["cuda_rng"][0])
+            torch.set_rng_state(state["rng"][0])
+            if device.type == "cuda" and len(state["rng"]) > 1:
+                torch.cuda.set_rng_state(state["rng"][1])
             run.cut_back(state["event_files"])
-        except Exception as error:  # whatever a checkpoint that someone has written by hand makes them raise
-            refuse("resume", run.path, f"its checkpoint does not fit this script ({type(error).__name__})")
-    tables = {"hyperparameters": vars(args), "provenance": provenance()}
-    run.log([], [(name, markdown_table(rows), global_step) for name, rows in tables.items()])
-
-    def from_envs(array: np.ndarray) -> Tensor:
-        """(N, 4, 84, 84) → (N, 84, 84, 4); flat observations stay as they are."""
-        return torch.from_numpy(array).to(device).movedim(1, -1)
+    run.describe(args, global_step)
 
     # Storage: T steps of N environments. Row T of `obs` and `values` is where the rollout ends and the next begins.
     T, N = args.num_steps, args.num_envs
     next_obs, _ = envs.reset(seed=env_seeds(args.seed, N, starts))
-    first_obs = from_envs(next_obs)
+    first_obs = from_envs(next_obs, device)
     obs = torch.zeros((T + 1, *first_obs.shape), dtype=first_obs.dtype, device=device)  # images stay uint8: 4x smaller
     values = torch.zeros((T + 1, N), device=device)
-    logprobs = torch.zeros((T, N, num_actions), device=device)  # of all actions, so that the KL is exact over them
+    # Of all actions, so that the KL is exact over them
+    logprobs = torch.zeros((T, N, envs.single_action_space.n), device=device)
     actions = torch.zeros((T, N), dtype=torch.int64, device=device)
     rewards = torch.zeros((T, N), device=device)
     terminations = torch.zeros((T, N), dtype=torch.bool, device=device)
@@ -534,27 +421,23 @@ def train(
     started = time.perf_counter()
     checkpoint_due = started  # at once, so that there is something to resume from at every moment
     iteration_ends = deque([started], maxlen=11)  # SPS is measured over the last 10 iterations
-    progress = tqdm(
-        initial=global_step,
-        total=args.num_iterations * args.batch_size,
-        disable=None,  # quiet where standard error is not a terminal
-        bar_format="{percentage:3.0f}% |{bar}| step {n:,}/{total:,}, {remaining} left{postfix}",
-    )
+    status_line = StatusLine()
 
     while True:
+        if args.capture_video and iteration in (args.num_iterations * quarter // 4 for quarter in range(5)):
+            record_game(args, agent, run, global_step)
+
         # Checkpoint: when due, and at the end
-        finished = iteration >= args.num_iterations or global_step >= (args.stop_at or math.inf)
-        if stop is not None and finished:
+        finished = iteration >= args.last_iteration
+        if finished:
             stop.number = 0  # a signal now comes too late to stop anything
-        finished = finished or (stop is not None and stop.number != 0)
+        finished = finished or stop.number != 0
         if finished or time.perf_counter() >= checkpoint_due:
             seconds = seconds_before + time.perf_counter() - started
             where = {"iteration": iteration, "global_step": global_step, "seconds": seconds, "starts": starts + 1}
             learnt = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"]}
-            cuda_rng = [torch.cuda.get_rng_state()] if device.type == "cuda" else []
-            randomness = {"rng": torch.get_rng_state(), "cuda_rng": cuda_rng}
-            scores = {"last_scores": list(last_scores)}
-            run.save({"args": saved_args(args), **where, **learnt, **randomness, **scores})
+            rng = [torch.get_rng_state(), *([torch.cuda.get_rng_state()] if device.type == "cuda" else [])]
+            run.save({**where, **learnt, "rng": rng, "last_scores": list(last_scores)}, args)
             checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
         if finished:
             break
@@ -574,13 +457,14 @@ def train(
             next_obs, reward, terminated, truncated, infos = envs.step(actions[t].cpu().numpy())
             stopwatch.lap("environment")
             global_step += N
-            obs[t + 1] = from_envs(next_obs)
+            obs[t + 1] = from_envs(next_obs, device)
             rewards[t] = torch.from_numpy(reward)
             terminations[t] = torch.from_numpy(terminated)
             truncations[t] = torch.from_numpy(truncated)
             if truncated.any():
                 final_obs = np.stack(infos["final_obs"][truncated])  # the other rows are uninitialised memory
-                final_values[t, truncations[t]] = value_of(agent, from_envs(final_obs))  # any batch size: not compiled
+                # By the agent as it is: compiled, it would be compiled anew for each number of them
+                final_values[t, truncations[t]] = value_of(agent, from_envs(final_obs, device))
             if "episode" in infos:
                 for n in np.flatnonzero(infos["_episode"]):
                     games.append((global_step, infos["episode"]["r"][n], infos["episode"]["l"][n]))
@@ -669,11 +553,11 @@ def train(
         run.log(points)
         stopwatch.lap("logging")
         run.log([(f"time/{phase}", seconds, global_step) for phase, seconds in stopwatch.seconds.items()])
+        left = timedelta(seconds=int((args.last_iteration - iteration) * args.batch_size / sps))
         score = f", score {np.mean(last_scores):.1f}" if last_scores else ""
-        progress.set_postfix_str(f"{sps:.0f} SPS{score}")
-        progress.update(args.batch_size)
+        line = f"step {global_step:,} of {args.last_iteration * args.batch_size:,}, {sps:.0f} SPS{score}, {left} left"
+        status_line.show(line, last=iteration == args.last_iteration)
 
-    progress.close()
     envs.close()
     return agent
 
@@ -683,40 +567,48 @@ def main() -> None:
     # TensorBoard's thread prints a traceback when the disk is full; RunDirectory says it in one line
     threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
     args, state, stop = tyro.cli(Args), None, StopSignal()
-    if args.resume is not None:
+    stop.listen()
+    directory, flag = args.resume or args.evaluate, "resume" if args.evaluate is None else "evaluate"
+    if directory is not None:
         try:
-            run = RunDirectory(args.resume)
-            state = run.load()
+            run = RunDirectory(directory)
+            state = run.load(Args)
         except BlockingIOError:
-            refuse("resume", args.resume, "another process is training there; wait for its end")
+            refuse(flag, directory, "another process is training there; wait for its end")
         except (OSError, ValueError) as error:
-            refuse("resume", args.resume, getattr(error, "strerror", None) or error)
-        args = tyro.cli(Args, default=replace(Args(**state["args"]), resume=args.resume))
+            refuse(flag, directory, getattr(error, "strerror", None) or error)
+        args = tyro.cli(Args, default=replace(Args(**state["args"]), resume=args.resume, evaluate=args.evaluate))
         for name in ("env_id", "num_envs", "num_steps", "seed", "exp_name", "log_dir"):
             if getattr(args, name) != state["args"][name]:
                 refuse(name, getattr(args, name), f"the run has {state['args'][name]}, which cannot change")
     args.check()
-    if state is not None and state["global_step"] >= min(
-        args.num_iterations * args.batch_size, args.stop_at or math.inf
-    ):
+    if args.resume is not None and state["iteration"] >= args.last_iteration:
         limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
         print(f"{args.resume} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")
         return
     try:
         envs = make_envs(args.env_id, args.num_envs, num_threads=args.threads)
+        if args.capture_video:
+            make_envs(args.env_id, 1, video="none yet")  # refused now, if it cannot be rendered
     except ValueError as error:
         refuse("env_id", args.env_id, error)
     if state is None:
         try:
-            run = RunDirectory(make_run_dir(args))  # last, so that nothing refused above leaves one behind
+            run = RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
         except OSError as error:
             refuse("log_dir", args.log_dir, f"cannot be written ({error.strerror}); give another directory")
-    train(args, envs, run, state, stop)
-    if run.failed:
-        sys.exit(1)
+    if args.evaluate is None:
+        agent = train(args, envs, run, state, stop)
+    else:
+        agent, _ = make_agent(args, envs)
+        with run.loading("evaluate"):
+            agent.load_state_dict(state["agent"])
     if stop.number:
         say(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path])}")
-        sys.exit(128 + stop.number)
+    elif not run.failed and args.eval_episodes > 0 and (args.evaluate or args.last_iteration == args.num_iterations):
+        stop.listen(signal.SIG_DFL)  # there is nothing left to save
+        evaluate(args, agent, run, run.load(Args))
+    sys.exit(1 if run.failed else 128 + stop.number if stop.number else 0)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
-"""One function, `make_envs`: Atari, or any Gymnasium environment with discrete actions, as a vector environment.
+"""What the two training scripts stand on: their environments, and the directory that a run is kept in.
 
-The training scripts import two names from here and nothing else of the project:
+Environments: Atari, or any Gymnasium environment with discrete actions, as a vector environment.
 
     envs = make_envs("Breakout", num_envs=8)
     next_obs, _ = envs.reset(seed=env_seeds(seed=1, num_envs=8))
@@ -9,16 +9,35 @@ Atari runs in ale-py's C++ threads under Gymnasium's own vector wrappers; `Episo
 neither has. Whatever else is registered with Gymnasium runs in a `SyncVectorEnv`. Both reset in the step that ends a
 game (`SAME_STEP`): with Gymnasium's default, `NEXT_STEP`, every game would be followed by a dummy transition that
 PPO then trains on.
+
+Run directory: `RunDirectory` holds a run's checkpoint, event files and `args.json`; `StopSignal` asks for a clean end.
+Nothing in this file knows the algorithm, and nothing of the algorithm stands outside the scripts.
 """
 
+import contextlib
 import difflib
+import fcntl
+import importlib.metadata
+import inspect
+import itertools
+import json
+import os
+import platform
 import re
+import shlex
+import signal
+import subprocess
+import sys
+import time
+import typing
 import warnings
-from collections.abc import Sequence
+import zipfile
+from collections.abc import Iterator, Sequence
 
 import ale_py
 import gymnasium as gym
 import numpy as np
+import torch
 from ale_py.vector_env import AtariVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete
@@ -32,6 +51,7 @@ from gymnasium.wrappers import (
     TransformAction,
 )
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
+from torch.utils.tensorboard import SummaryWriter
 
 gym.register_envs(ale_py)
 
@@ -40,7 +60,10 @@ SCREEN = (84, 84)  # height and width of an observation, pixels
 STACK = 4  # most recent screens in an observation
 
 
-def make_envs(env_id: str, num_envs: int, num_threads: int = 0, max_frames: int = 108_000) -> VectorEnv:
+# ------------------------------------------------------------------------------------------------- environments
+def make_envs(
+    env_id: str, num_envs: int, num_threads: int = 0, max_frames: int = 108_000, video: str | None = None
+) -> VectorEnv:
     """Builds `num_envs` copies of an environment, stepped together, each reset in the step that ends its game.
 
     Args:
@@ -50,6 +73,7 @@ def make_envs(env_id: str, num_envs: int, num_threads: int = 0, max_frames: int 
         num_envs: the number of copies N.
         num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
         max_frames: emulator frames after which an Atari game is truncated, counted from the end of its no-ops.
+        video: a WebM file that the first game of the first environment is written to, from each `reset` on.
 
     Returns:
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
@@ -59,30 +83,30 @@ def make_envs(env_id: str, num_envs: int, num_threads: int = 0, max_frames: int 
         that it ended on (rows of other environments are not to be read).
 
     Raises:
-        ValueError: the environment is unknown, cannot be built, or has spaces that are not supported.
+        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
     """
     if (atari := find_atari_game(env_id)) is None:
-        return make_gymnasium_envs(env_id, num_envs)
+        return make_gymnasium_envs(env_id, num_envs, video)
     rom, repeat_action_probability = atari
-    envs = AtariVectorEnv(
-        rom,
-        num_envs,
-        num_threads=num_threads,
-        max_num_frames_per_episode=max_frames,
-        repeat_action_probability=repeat_action_probability,
-        frameskip=FRAME_SKIP,
-        img_height=SCREEN[0],
-        img_width=SCREEN[1],
-        stack_num=STACK,
-        autoreset_mode=AutoresetMode.SAME_STEP,
-        maxpool=True,  # over the last two frames: sprites flicker
-        noop_max=30,  # 0 to 29 of them
-        full_action_space=False,
-        episodic_life=False,  # would reset the whole game at a lost life: later lives are never seen
-        life_loss_info=False,  # would report it, but as the end of a game to the statistics below as well
-        reward_clipping=False,  # would hide the score
-        use_fire_reset=False,  # would press FIRE before the no-ops, and never after a lost life
-    )
+    options = {
+        "num_threads": num_threads,
+        "max_num_frames_per_episode": max_frames,
+        "repeat_action_probability": repeat_action_probability,
+        "frameskip": FRAME_SKIP,
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+        "maxpool": True,  # over the last two frames: sprites flicker
+        "noop_max": 30,  # 0 to 29 of them
+        "full_action_space": False,
+        "episodic_life": False,  # would reset the whole game at a lost life: later lives are never seen
+        "life_loss_info": False,  # would report it, but as the end of a game to the statistics below as well
+        "reward_clipping": False,  # would hide the score
+        "use_fire_reset": False,  # would press FIRE before the no-ops, and never after a lost life
+    }
+    envs = AtariVectorEnv(rom, num_envs, img_height=SCREEN[0], img_width=SCREEN[1], stack_num=STACK, **options)
+    if video is not None:  # at the bottom, where the actions are those that the games get
+        in_colour = {"grayscale": False, "img_height": 210, "img_width": 160, "stack_num": 1}
+        twin = AtariVectorEnv(rom, num_envs, **in_colour, **options)  # same seeds, same actions: the same games
+        envs = RecordVideo(envs, video, 60 / FRAME_SKIP, twin)
     envs = RecordEpisodeStatistics(envs)  # above EpisodicLife it would count lives, above the sign clipped rewards
     envs = EpisodicLife(envs)
     return TransformReward(envs, np.sign)
@@ -97,6 +121,70 @@ def env_seeds(seed: int, num_envs: int, starts: int = 0) -> list[int]:
     """
     numbers = np.random.SeedSequence(seed).generate_state(num_envs * (starts + 1)) >> 1
     return [int(number) for number in numbers[-num_envs:]]
+
+
+class RecordVideo(VectorWrapper):
+    """Writes the first game of the first environment to a WebM file (VP9): in colour, without sound, in real time.
+
+    Shows the screens of `twin`, games in lockstep with the agent's, or what the environments render. The last screen
+    of a game is there only with a twin: others have already been reset when they can be asked.
+    """
+
+    def __init__(self, envs: VectorEnv, path: str, fps: float, twin: VectorEnv | None = None):
+        super().__init__(envs)
+        self.path, self.fps, self.twin, self.video = path, fps, twin, None
+
+    def reset(self, *, seed=None, options=None):
+        """Begins the file anew. Raises OSError where it cannot be written."""
+        obs, infos = self.env.reset(seed=seed, options=options)
+        screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed)[0][0, 0]
+        import cv2  # here, because it changes the environment variables of whoever imports it
+
+        with silent():  # about a tag that WebM does without
+            vp9 = cv2.VideoWriter_fourcc(*"VP90")
+            self.video = cv2.VideoWriter(self.path, cv2.CAP_FFMPEG, vp9, self.fps, screen.shape[1::-1])
+        if not self.video.isOpened():
+            raise OSError(f"OpenCV cannot write {self.path}")
+        self.write(screen)
+        return obs, infos
+
+    def step(self, actions: np.ndarray):
+        result = self.env.step(actions)
+        game_over = result[2][0] or result[3][0]
+        if self.twin is not None:
+            obs, *_, infos = self.twin.step(actions)
+            self.write((infos["final_obs"] if game_over else obs)[0, 0])
+        elif not game_over:
+            self.write(self.env.render()[0])
+        if game_over:
+            self.finish()
+        return result
+
+    def write(self, screen: np.ndarray) -> None:
+        if self.video is not None:
+            self.video.write(np.ascontiguousarray(screen[..., ::-1]))  # OpenCV takes blue first
+
+    def finish(self) -> None:
+        if self.video is not None:
+            self.video.release()
+        self.video = None
+
+    def close(self, **kwargs):
+        self.finish()
+        super().close(**kwargs)
+
+
+@contextlib.contextmanager
+def silent() -> Iterator[None]:
+    """Keeps what C code prints in its body from standard error."""
+    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(nowhere)
 
 
 class EpisodicLife(VectorWrapper):
@@ -173,7 +261,7 @@ def atari_specs() -> dict[str, EnvSpec]:
     return {spec.name.lower(): spec for spec in gym.registry.values() if spec.namespace == "ALE"}
 
 
-def make_gymnasium_envs(env_id: str, num_envs: int) -> VectorEnv:
+def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) -> VectorEnv:
     """Builds `make_envs`'s vector environment for an id that is not Atari. Raises ValueError as `make_envs` does."""
     try:
         if not re.fullmatch(r"(\w+(\.\w+)*:)?[\w/.-]+", env_id):
@@ -186,8 +274,11 @@ def make_gymnasium_envs(env_id: str, num_envs: int) -> VectorEnv:
                 vectorization_mode="sync",
                 vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
                 wrappers=[preprocess],
+                **({} if video is None else {"render_mode": "rgb_array"}),
             )
             envs.reset()  # an environment that cannot start is refused here, too
+            if video is not None and envs.render()[0] is None:
+                raise ValueError("no video can be made of it, it does not render to rgb_array")
     except gym.error.UnregisteredEnv as error:
         names = [spec.name for spec in atari_specs().values()]
         names += [spec.id for spec in gym.registry.values() if spec.namespace is None and not is_atari(spec)]
@@ -199,6 +290,8 @@ def make_gymnasium_envs(env_id: str, num_envs: int) -> VectorEnv:
         raise
     except Exception as error:  # whatever a foreign constructor raises
         raise ValueError(f"it cannot be built: {error or type(error).__name__}") from error
+    if video is not None:
+        envs = RecordVideo(envs, video, envs.metadata.get("render_fps", 30))
     return RecordEpisodeStatistics(envs)
 
 
@@ -232,3 +325,225 @@ def preprocess(env: gym.Env) -> gym.Env:
         env = GrayscaleObservation(env) if shape[-1] == 3 else ReshapeObservation(env, shape[:2])
     env = ResizeObservation(env, SCREEN)  # before the stack: one screen is resized, not four
     return FrameStackObservation(env, STACK)
+
+
+# ------------------------------------------------------------------------------------------------ run directory
+OF_ONE_CALL = {"resume", "evaluate", "stop_at"}  # arguments that a run does not keep
+LAYOUT = {  # of TensorBoard's page "Custom Scalars"
+    "The thesis's figures": {
+        "score, mean of the last 100 games (4.1)": ["Multiline", ["charts/mean_return_100"]],
+        "KL between policy updates (4.2)": ["Multiline", ["losses/kl"]],
+        "average clip ratio (C.1)": ["Multiline", ["losses/avg_clip_ratio"]],
+        "clip fraction": ["Multiline", ["losses/clipfrac"]],
+    }
+}
+
+
+class RunDirectory:
+    """A run's event files and its checkpoint, held by one process at a time; a full disk costs points, not the run."""
+
+    def __init__(self, path: str):
+        """Opens an existing directory. Raises OSError; BlockingIOError where another process holds it."""
+        self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
+        self.lock = os.open(path, os.O_RDONLY)
+        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
+        self.writer = None
+        self.failed = False  # has anything not been written?
+        self.waiting = False  # for the next checkpoint to succeed, before more is logged?
+
+    @classmethod
+    def make(cls, args) -> "RunDirectory":
+        """Makes a new run's directory in `args.log_dir`; a name that is taken moves on to the next second."""
+        name = re.sub(r"[^\w.-]", "-", args.env_id)
+        for second in itertools.count(int(time.time())):
+            path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
+            with contextlib.suppress(FileExistsError):
+                os.makedirs(path)
+                return cls(path)
+
+    def describe(self, args, step: int) -> None:
+        """Writes what the run is to `args.json`, and as text to TensorBoard, with the layout of its custom scalars."""
+        about = {"command": command_line(args), "args": saved_args(args), "provenance": provenance()}
+        with self.reporting(), open(os.path.join(self.path, "args.json"), "w") as file:
+            json.dump(about, file, indent=2)
+        with self.logging():
+            self.writer = SummaryWriter(self.path)
+            self.writer.add_custom_scalars(LAYOUT)
+            for tag, rows in (("hyperparameters", about["args"]), ("provenance", about["provenance"])):
+                table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
+                self.writer.add_text(tag, "\n".join(table), step)
+
+    def log(self, points: list[tuple]) -> None:
+        """Writes (tag, value, agent step) to TensorBoard."""
+        with self.logging():
+            if not self.waiting:
+                self.writer = self.writer or SummaryWriter(self.path)
+                for point in points:
+                    self.writer.add_scalar(*point)
+                self.writer.flush()
+
+    @contextlib.contextmanager
+    def logging(self) -> Iterator[None]:
+        """Reports what cannot be written to TensorBoard in its body; no more is until a checkpoint has been."""
+        try:
+            yield
+        except OSError as error:
+            self.writer, self.waiting = None, True  # its thread has died of it; there is a successor after a checkpoint
+            self.report(error)
+
+    @contextlib.contextmanager
+    def reporting(self) -> Iterator[None]:
+        """Reports what else cannot be written in its body."""
+        try:
+            yield
+        except OSError as error:
+            self.report(error)
+
+    def save(self, state: dict, args) -> None:
+        """Writes a checkpoint beside the last one and renames it over: at every instant one of the two is whole."""
+        new = self.checkpoint + ".new"
+        try:
+            with open(new, "wb") as file:
+                torch.save({**state, "args": saved_args(args), "event_files": self.event_files()}, file)
+            for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
+                with open(name, "rb+") as file:  # on the disk before the rename is, also if the power fails
+                    os.fsync(file.fileno())
+            os.replace(new, self.checkpoint)
+            os.fsync(self.lock)
+            self.waiting = False
+        except (OSError, RuntimeError) as error:  # torch raises the latter where the file raised the former
+            self.report(error)
+            with contextlib.suppress(OSError):
+                os.remove(new)  # half of it would fill the disk further
+
+    def report(self, error: Exception) -> None:
+        if not self.failed:
+            say(f"{self.path}: {error}; training goes on, what cannot be written is lost")
+        self.failed = True
+
+    def load(self, args_class: type) -> dict:
+        """Returns the checkpoint. Raises ValueError where there is none, or none of a script with these arguments."""
+        if not os.path.exists(self.checkpoint):
+            raise ValueError("it holds no checkpoint; start the run anew")
+        try:
+            with zipfile.ZipFile(self.checkpoint) as archive:
+                whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
+            state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+            args, hints = state["args"], typing.get_type_hints(args_class)
+            whole &= {type(state[name]) for name in ("iteration", "global_step", "starts")} == {int}
+            whole &= {float} == {type(number) for number in (state["seconds"], *state["last_scores"])}
+            whole &= state["global_step"] == state["iteration"] * args["num_envs"] * args["num_steps"]
+            whole &= all(isinstance(value, hints.get(name, ())) for name, value in args.items())
+        except Exception as error:  # whatever a file that is no checkpoint makes them raise
+            raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
+        if not whole or args.keys() != hints.keys() - OF_ONE_CALL:
+            raise ValueError("its checkpoint is damaged, or of another script")
+        return state
+
+    @contextlib.contextmanager
+    def loading(self, flag: str = "resume") -> Iterator[None]:
+        """Refuses a checkpoint whose parts its body cannot take, whatever one written by hand makes that raise."""
+        try:
+            yield
+        except Exception as error:
+            refuse(flag, self.path, f"its checkpoint does not fit this script ({type(error).__name__})")
+
+    def event_files(self) -> dict[str, int]:
+        """Returns the size in bytes of each event file, by name."""
+        return {file.name: file.stat().st_size for file in os.scandir(self.path) if file.name.startswith("events.")}
+
+    def cut_back(self, event_files: dict[str, int]) -> None:
+        """Takes out of the event files what was logged after the checkpoint, for every reader of them."""
+        for name, size in self.event_files().items():
+            os.truncate(os.path.join(self.path, name), min(size, event_files.get(name, 0)))
+
+
+class StopSignal:
+    """Notes the first SIGINT or SIGTERM in `number`, for a clean end; a second ends the process at once."""
+
+    number = 0
+
+    def listen(self, handler=None) -> None:
+        """From here on; `signal.SIG_DFL` gives the signals back to the system."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, handler or self.note)
+
+    def note(self, number: int, frame: object) -> None:
+        self.number = number
+        self.listen(signal.SIG_DFL)
+        say("\nStopping after this iteration, with a checkpoint; once more ends at once")
+
+
+class StatusLine:
+    """One line that is written over in a terminal; a new line each minute where standard error goes to a file."""
+
+    def __init__(self):
+        self.due = time.perf_counter() + 60
+
+    def show(self, line: str, last: bool) -> None:
+        if sys.stderr.isatty():
+            say(f"\r{line:<79}", end="\n" if last else "")
+        elif time.perf_counter() >= self.due:
+            say(line)
+            self.due += 60
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Writes to standard error, whatever has become of it: the end of a pipe or a full disk must not end the run."""
+    with contextlib.suppress(OSError):
+        os.write(2, (text + end).encode())
+
+
+def saved_args(args) -> dict[str, object]:
+    """Returns the arguments that belong to the run, not to one call of it."""
+    return {name: value for name, value in vars(args).items() if name not in OF_ONE_CALL}
+
+
+def command_line(args) -> str:
+    """Returns the command that repeats the run: what is not the default, and what decides most in any case."""
+    words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], saved_args(type(args)())
+    for name, value in saved_args(args).items():
+        if value != defaults[name] or name in ("env_id", "seed", "threads"):
+            words.append(f"--{'no-' if value is False else ''}{name.replace('_', '-')}")
+            words += [] if isinstance(value, bool) else [str(value)]
+    return shlex.join(words)
+
+
+def provenance() -> dict[str, object]:
+    """Returns what a reader needs to repeat a run besides its arguments: versions, commit, machine, threads."""
+    packages = ["torch", "gymnasium", "ale-py", "numpy", "opencv-python-headless", "tensorboard", "tyro"]
+    git = ["git", "-C", os.path.dirname(os.path.abspath(__file__)), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:  # --exclude: no tags, the commit itself
+        commit = subprocess.run([*git, "--exclude=*"], capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "not a git checkout"
+    versions = {package: importlib.metadata.version(package) for package in packages}
+    machine = f"{platform.platform()}, {available_cores()} cores, {torch.backends.cpu.get_cpu_capability()}"
+    threads = f"{torch.get_num_threads()} torch, OMP_WAIT_POLICY {os.environ.get('OMP_WAIT_POLICY', 'not set')}"
+    return {"commit": commit, "python": platform.python_version(), **versions, "machine": machine, "threads": threads}
+
+
+class Stopwatch:
+    """Adds up the seconds spent in each phase of an iteration (a GPU's work counts where it is waited for)."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self.last = time.perf_counter()
+
+    def lap(self, phase: str) -> None:
+        """Counts the time since the last lap as `phase`."""
+        now = time.perf_counter()
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self.last
+        self.last = now
+
+
+# ------------------------------------------------------------------------------------------------ command line
+def available_cores() -> int:
+    """Returns the number of cores this process may run on: its affinity, where the system has one."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def refuse(name: str, given: object, advice: object) -> typing.NoReturn:
+    """Ends the program with status 2 and one line: the flag, what was given to it, and what to do."""
+    print(" ".join(f"--{name.replace('_', '-')} {given}: {advice}".split()), file=sys.stderr)
+    sys.exit(2)

@@ -73,7 +73,7 @@ def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     before = checkpoint_of(tmp_path)
     os.close(run.lock)
     run = script.RunDirectory(str(tmp_path))
-    script.train(args, make_envs("CartPole-v1", 4), run, run.load())
+    script.train(args, make_envs("CartPole-v1", 4), run, run.load(script.Args))
     after = checkpoint_of(tmp_path)
     assert before["optimizer"].keys() == after["optimizer"].keys() and len(before["optimizer"]) > 0
     for index, moments in before["optimizer"].items():
@@ -214,7 +214,7 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
     """A byte of padding between the parts of the file may change; nothing that is read from it may."""
     run = script.RunDirectory(str(finished))
     path, offsets = finished / "checkpoint.pt", random.Random(3)
-    whole, original = path.read_bytes(), run.load()
+    whole, original = path.read_bytes(), run.load(script.Args)
     refused = 0
     for attempt in range(200):
         damaged = bytearray(whole)
@@ -224,7 +224,7 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
             damaged[offsets.randrange(len(whole))] ^= 1 << offsets.randrange(8)
         path.write_bytes(damaged)
         try:
-            state = run.load()
+            state = run.load(script.Args)
         except ValueError as error:
             refused += "damaged" in str(error)
         else:

@@ -9,7 +9,7 @@ from conftest import ROOT
 PLACES = {  # what a hunk may touch: lines from the one to the other, the second not included
     "docstring": ('"""', "Sections: "),
     "Args": ("class Args:", "@property"),
-    "its checks": ("def check(", "def available_cores("),
+    "its checks": ("def check(", "class Agent("),
     "clip_range": ("def clip_range(", "def surrogate("),
     "the line that calls it": ("clip = clip_range(", "pg_loss = "),
 }

@@ -33,6 +33,20 @@ class TinyPixels(gym.Env):
         return screen
 
 
+class RenderedPixels(TinyPixels):
+    """The same with a picture for videos."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, render_mode: str | None = None):
+        super().__init__()
+        self.render_mode = render_mode
+
+    def render(self):
+        return self.screen()
+
+
+gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
 gym.register("TinyPixels-v0", TinyPixels, max_episode_steps=20)
 gym.register("TinyPixelsGrey-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": None})
 gym.register("TinyPixelsOneChannel-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": 1})

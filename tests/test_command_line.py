@@ -32,6 +32,8 @@ def test_a_run_logs_every_documented_tag_with_finite_values(script, env_id, tmp_
         num_steps,
         "--total-timesteps",
         "1024",
+        "--eval-episodes",
+        "4",
         cwd=tmp_path,
     )
     assert (run.returncode, run.stderr) == (0, "")

@@ -1,0 +1,343 @@
+"""The figures and tables: what is read from the logs, what is made of it, and what a call may touch."""
+
+import itertools
+import json
+import math
+import shutil
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.figure import Figure
+from torch.utils.tensorboard import SummaryWriter
+
+from benchmark import figures
+from conftest import ROOT
+
+BATCH = 1024  # agent steps of an iteration
+
+
+def make_arguments(variant: str, game: str, seed: int) -> dict:
+    epsilon = {"clip_coef": 0.16, "c": 1.0} if variant == "acppo" else {"clip_coef": 0.1}
+    sizes = {"total_timesteps": 10 * BATCH, "num_envs": 8, "num_steps": 128}
+    return {"exp_name": variant, "env_id": game, "seed": seed, **sizes, **epsilon}
+
+
+def make_run(out, variant="ppo", game="CartPole-v1", seed=1, started=1, **columns):
+    """Makes a run's directory as a script does: an event file with `columns`, a value an iteration, and args.json."""
+    directory = out / "runs" / f"{game}__{variant}__{seed}__{started}"
+    directory.mkdir(parents=True)
+    log(directory, {figures.TAGS[column]: dict(enumerate(values, start=1)) for column, values in columns.items()})
+    provenance = {"commit": "abc", "python": "3.12", "torch": "2.13.0", "machine": "a machine", "threads": 1}
+    record = {"command": "ppo_atari.py", "args": make_arguments(variant, game, seed), "provenance": provenance}
+    (directory / "args.json").write_text(json.dumps(record))
+    return directory
+
+
+def log(directory, points: dict[str, dict[int, float]], suffix: str = "", time: float | None = None) -> None:
+    """Writes an event file: tag → iteration → value, written at `time` (seconds since the epoch, or now)."""
+    writer = SummaryWriter(str(directory), filename_suffix=suffix)
+    for tag, values in points.items():
+        for iteration, value in values.items():
+            writer.add_scalar(tag, value, iteration * BATCH, walltime=time)
+    writer.close()
+
+
+def make_csvs(out, runs: dict[tuple, dict]) -> figures.Curves:
+    """Writes the two CSVs: (variant, game, seed) → column → a value an iteration; what is not given is 0.1."""
+    rows, curves = [], []
+    for (variant, game, seed), columns in runs.items():
+        curve = pd.DataFrame(columns).reindex(columns=list(figures.TAGS), fill_value=0.1)
+        curve["step"] = BATCH * np.arange(1, len(curve) + 1)
+        key = {"variant": variant, "game": game, "seed": seed}
+        curves.append(curve.assign(**key))
+        arguments = json.dumps(make_arguments(variant, game, seed))
+        place = {"commit": "abc", "machine": "a machine", "threads": "1", "versions": "{}", "command": "ppo_atari.py"}
+        rows.append({**key, **place, "steps": curve.step.max(), "total_timesteps": 10 * BATCH, "arguments": arguments})
+    out.mkdir(parents=True, exist_ok=True)
+    pd.DataFrame(rows)[figures.RUN_COLUMNS].to_csv(out / "runs.csv", index=False)
+    pd.concat(curves)[figures.CURVE_COLUMNS].to_csv(out / "curves.csv", index=False)
+    return figures.by_run(figures.read_csvs(out)[1])
+
+
+def make_pairs(out, differences: dict[str, list[float]], **acppo) -> figures.Curves:
+    """Writes CSVs of a pair for each final difference of scores, by game."""
+    runs = {}
+    for game, of_game in differences.items():
+        for seed, difference in enumerate(of_game, start=1):
+            runs["ppo", game, seed] = {"mean_return_100": [0, 10]}
+            runs["acppo", game, seed] = {"mean_return_100": [0, 10 + difference], **acppo}
+    return make_csvs(out, runs)
+
+
+def call(monkeypatch, *flags) -> None:
+    monkeypatch.setattr(sys, "argv", ["figures.py", *map(str, flags)])
+    figures.main()
+
+
+def contents(directory) -> dict[str, bytes]:
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def cells(markdown: str) -> list[list[str]]:
+    lines = [line for line in markdown.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+# ----------------------------------------------------------------------------------------------------- collect
+def test_all_of_20000_points_are_read(tmp_path):
+    directory = make_run(tmp_path, kl=range(20_000))
+    curve = figures.read_curve(directory)
+    assert list(curve.index) == [BATCH * i for i in range(1, 20_001)]
+    assert list(curve.kl) == list(range(20_000))
+
+
+def test_a_step_that_was_logged_twice_keeps_what_was_written_last(tmp_path):
+    directory = make_run(tmp_path, kl=[1, 2, 3, 4])
+    log(directory, {"losses/kl": {3: 30, 4: 40, 5: 50}, "losses/clipfrac": {5: 0.5}}, suffix=".resumed")
+    log(directory, {"losses/kl": {1: -1}}, suffix=".the-last-name-but-the-first-to-be-written", time=1.0)
+    log(directory, {"losses/kl": {5: 55}}, suffix=".again")
+    curve = figures.read_curve(directory)
+    assert list(curve.kl) == [1, 2, 30, 40, 55]
+    assert curve.clipfrac.iloc[-1] == 0.5 and curve.clipfrac[:-1].isna().all()
+
+
+def test_a_run_gives_a_row_and_its_iterations_with_six_digits(tmp_path):
+    make_run(tmp_path, "acppo", seed=7, kl=[1 / 3, 1e-5 / 3], mean_return_100=[9, 10])
+    figures.collect(tmp_path)
+    run = pd.read_csv(tmp_path / "runs.csv").iloc[0]
+    assert (run.variant, run.game, run.seed, run.steps, run.total_timesteps) == ("acppo", "CartPole-v1", 7, 2048, 10240)
+    assert (run.commit, run.machine, run.threads) == ("abc", "a machine", 1)
+    assert json.loads(run.versions) == {"python": "3.12", "torch": "2.13.0"}
+    assert json.loads(run.arguments) == make_arguments("acppo", "CartPole-v1", 7)
+    lines = (tmp_path / "curves.csv").read_text().splitlines()
+    assert lines[1:] == ["acppo,CartPole-v1,7,1024,9,0.333333,,,,,,", "acppo,CartPole-v1,7,2048,10,3.33333e-06,,,,,,"]
+
+
+def test_runs_without_a_directory_keep_their_rows_and_found_ones_replace_theirs(tmp_path, capsys):
+    first = make_run(tmp_path, seed=1, kl=[1, 2])
+    make_run(tmp_path, seed=2, kl=[3])
+    figures.collect(tmp_path)
+    shutil.rmtree(first)
+    log(tmp_path / "runs" / "CartPole-v1__ppo__2__1", {"losses/kl": {2: 4}}, suffix=".more")
+    make_run(tmp_path, "acppo", kl=[5])
+    figures.collect(tmp_path)
+    assert capsys.readouterr().err == ""
+    runs, curves = figures.read_csvs(tmp_path)
+    assert list(zip(runs.variant, runs.seed, runs.steps)) == [("acppo", 1, 1024), ("ppo", 1, 2048), ("ppo", 2, 2048)]
+    assert list(curves.kl) == [5, 1, 2, 3, 4]
+    before = contents(tmp_path)
+    figures.collect(tmp_path)
+    assert contents(tmp_path) == before
+    make_run(tmp_path, seed=1, kl=[6])
+    figures.collect(tmp_path)
+    assert list(figures.read_csvs(tmp_path)[1].kl) == [5, 6, 3, 4]
+    assert capsys.readouterr().err == "ppo CartPole-v1 1: 1024 steps replace 2048\n"
+
+
+def test_of_two_directories_of_a_run_the_one_that_got_further_counts(tmp_path, capsys):
+    make_run(tmp_path, started=1, kl=[1, 1, 1])
+    make_run(tmp_path, started=2, kl=[2, 2])
+    figures.collect(tmp_path)
+    assert list(figures.read_csvs(tmp_path)[1].kl) == [1, 1, 1]
+    assert (
+        capsys.readouterr().err
+        == "ppo CartPole-v1 1: CartPole-v1__ppo__1__1 counts, CartPole-v1__ppo__1__2 got no further\n"
+    )
+
+
+def test_a_directory_that_is_no_run_is_left_out_and_said(tmp_path, capsys):
+    make_run(tmp_path, kl=[1])
+    (make_run(tmp_path, seed=2, kl=[1]) / "args.json").write_text("{")
+    (make_run(tmp_path, seed=3, kl=[1]) / "args.json").unlink()
+    make_run(tmp_path, seed=4)
+    (make_run(tmp_path, seed=5, kl=[1]) / "args.json").write_text("[]")
+    figures.collect(tmp_path)
+    assert list(figures.read_csvs(tmp_path)[0].seed) == [1]
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == 4 and all("left out" in line for line in said)
+
+
+# -------------------------------------------------------------------------------------------------- statistics
+@pytest.mark.parametrize(
+    ("values", "mean"),
+    [([5], 5), ([1, 2], 1.5), ([100, 0, 1, 2], 1.5), ([0, 1, 2, 5, 100], (0.75 * 1 + 2 + 0.75 * 5) / 2.5)],
+)
+def test_the_interquartile_mean_weighs_borders_by_their_part_inside(values, mean):
+    assert figures.interquartile_mean(np.array(values, dtype=float)) == pytest.approx(mean)
+
+
+def test_the_interval_is_that_of_all_ways_to_redraw_seeds_within_games():
+    strata = [np.array([0.1, 0.5, 0.4]), np.array([1.0, 3.0, 1.7])]
+    ways = [list(itertools.product(values, repeat=3)) for values in strata]  # 27 × 27, equally likely
+    means = [figures.interquartile_mean(np.array(one + other)) for one, other in itertools.product(*ways)]
+    low, high = figures.bootstrap_interval(strata)
+    assert np.mean(np.less(means, low - 1e-9)) < 0.03 and np.mean(np.less(means, low + 1e-9)) > 0.02
+    assert np.mean(np.greater(means, high + 1e-9)) < 0.03 and np.mean(np.greater(means, high - 1e-9)) > 0.02
+    assert (low, high) == figures.bootstrap_interval(strata)
+    # Across games 0 and 10 would mix; within a game there is nothing to mix
+    assert figures.bootstrap_interval([np.zeros(3), np.full(3, 10.0)]) == (5, 5)
+    assert figures.bootstrap_interval([np.zeros(3), np.zeros(1)]) is None
+
+
+def test_both_spike_rates_as_counted_by_hand_up_to_the_last_common_step(tmp_path):
+    ppo = [1] * 93 + [9] * 2 + [20] * 5  # 99th percentile 20, median 1
+    acppo = [1] * 97 + [30] * 3
+    curves = make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": ppo + [99] * 50}, ("acppo", "Pong", 1): {"kl": acppo}})
+    margins = figures.find_margins(curves)
+    assert margins["spikes"]["Pong"] == pytest.approx([0 - 0.03])
+    assert margins["jumps"]["Pong"] == pytest.approx([0.05 - 0.03])
+    assert margins["KL"]["Pong"] == pytest.approx([math.log(2.11 / 1.87)])
+    (ppo_row, acppo_row) = cells(
+        figures.kl_table(make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}}))
+    )[2:]
+    assert ppo_row == ["Pong", "ppo", "1", "102,400", "2.11", "1", "20", "20", "0.00%", "5.00%", "0.1000"]
+    assert acppo_row == ["Pong", "acppo", "1", "102,400", "1.87", "1", "30", "30", "3.00%", "3.00%", "0.1000"]
+
+
+@pytest.mark.parametrize(
+    ("differences", "judged"),
+    [
+        ([1, 2, 3], "holds on Pong (3 of 3 pairs)"),
+        ([-1, -2, -3], "does not hold on Pong (0 of 3 pairs)"),
+        ([1, 2, -3], "cannot be told apart with these runs on Pong (2 of 3 pairs)"),
+        ([1, 2, 0], "cannot be told apart with these runs on Pong (2 of 3 pairs, 1 equal)"),
+        ([1, 2], "cannot be told apart with these runs on Pong (2 of 2 pairs)"),
+        ([-1], "cannot be told apart with these runs on Pong (0 of 1 pairs)"),
+        ([math.nan, 1, 1, 1], "holds on Pong (3 of 3 pairs)"),
+    ],
+)
+def test_a_claim_holds_on_a_game_where_three_or_more_pairs_all_have_its_sign(differences, judged, tmp_path):
+    curves = make_pairs(tmp_path, {"Pong": differences})
+    assert figures.claim_lines(curves).splitlines()[0] == f"- AC-PPO's final score is above PPO's: {judged}."
+
+
+@pytest.mark.parametrize(
+    ("pong", "breakout", "judged"),
+    [
+        ([5, 6, 7], [1, 2, 3], "holds"),
+        ([-5, -6, -7], [-1, -2, -3], "does not hold"),
+        ([5, 6, 7], [-4, -5, -6], "cannot be told apart with these runs"),
+        ([5, 6, 7], [1, 2], "cannot be told apart with these runs"),
+        ([5, 6, 7], [1], "cannot be told apart with these runs"),
+    ],
+)
+def test_a_claim_is_judged_across_games_by_its_interval(pong, breakout, judged, tmp_path):
+    curves = make_pairs(tmp_path, {"Pong": pong, "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
+    strata = [np.array(breakout) / (30.5 - 1.7), np.array(pong) / (14.6 + 20.7)]  # CartPole has no human score
+    mean, interval = figures.interquartile_mean(np.concatenate(strata)), figures.bootstrap_interval(strata)
+    shown = "no interval: one seed" if interval is None else "{:.3f} to {:.3f}".format(*interval)
+    line = figures.claim_lines(curves).splitlines()[0]
+    assert f"**{judged} across games** (margin {mean:.3f} of human minus random score; {shown})" in line
+
+
+def test_a_clip_ratio_holds_inside_its_band_for_every_run(tmp_path):
+    for ratio, judged in ((0.119, "holds"), (0.121, "does not hold"), (0.079, "does not hold")):
+        curves = make_pairs(tmp_path, {"Pong": [0, 0, 0]}, avg_clip_ratio=[ratio, ratio])
+        assert figures.claim_lines(curves).splitlines()[-1].split(": ")[1].startswith(f"{judged} on Pong")
+
+
+# ------------------------------------------------------------------------------------------ tables and figures
+def test_the_score_table_gives_mean_and_sample_deviation_where_all_seeds_are(tmp_path):
+    runs = {
+        ("ppo", "BattleZone", 1): {"mean_return_100": [0, 10, 99]},
+        ("ppo", "BattleZone", 2): {"mean_return_100": [0, 20]},
+        ("acppo", "BattleZone", 1): {"mean_return_100": [0, 12]},
+        ("acppo", "CartPole-v1", 1): {"mean_return_100": [math.nan, math.nan]},
+    }
+    header, _, battle_zone, cartpole = cells(figures.score_table(make_csvs(tmp_path, runs)))
+    assert battle_zone[:3] == ["BattleZone", "15.0 ± 7.1 (n = 2, 2,048)", "12.0 (n = 1, 2,048)"]
+    ppo2 = header.index("openai/baselines ppo2 (CleanRL docs/benchmark), 10,000,000")
+    assert battle_zone[ppo2] == "19,980.0 ± 1,355.2"
+    assert cartpole == ["CartPole-v1"] + ["–"] * (len(header) - 1)
+
+
+def test_the_human_normalised_table_says_where_seeds_are_too_few_for_an_interval(tmp_path):
+    curves = make_pairs(tmp_path, {"Pong": [3.53]})  # a tenth of the human range
+    table = cells(figures.human_table(curves))[2:]
+    assert table[0] == ["ppo", "1", "1", f"{(10 + 20.7) / 35.3:.3f}", "no interval: one seed"]
+    assert table[2] == ["acppo − ppo, by pairs", "1", "1", "0.100", "no interval: one seed"]
+
+
+@pytest.mark.parametrize(("game", "frames"), [("BattleZone", 4), ("ALE/Pong-v5", 4), ("CartPole-v1", 1)])
+def test_the_horizontal_axis_counts_frames_on_atari_alone(game, frames, tmp_path):
+    axis = Figure().subplots()
+    curves = make_csvs(tmp_path, {("ppo", game, 1): {"mean_return_100": [1, 2, 3]}})
+    figures.draw_panel(axis, curves, game, "mean_return_100")
+    assert list(axis.lines[-1].get_xdata()) == [frames * BATCH * i for i in (1, 2, 3)]
+    assert list(axis.lines[-1].get_ydata()) == [1, 2, 3]
+
+
+def test_mean_and_band_are_over_seeds_as_far_as_all_have_got(tmp_path):
+    axis = Figure().subplots()
+    scores = {1: [1, 2, 3], 2: [3, 6]}
+    curves = make_csvs(tmp_path, {("ppo", "Pong", seed): {"mean_return_100": of} for seed, of in scores.items()})
+    figures.draw_panel(axis, curves, "Pong", "mean_return_100")
+    np.testing.assert_equal(axis.lines[-1].get_ydata(), [2, 4, math.nan])
+    band = axis.collections[0].get_paths()[0].vertices
+    assert band[:, 1].min() == pytest.approx(2 - math.sqrt(2)) and band[:, 1].max() == pytest.approx(4 + math.sqrt(8))
+
+
+def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_path, monkeypatch):
+    """The default grid writes the README beside it, another grid neither that nor anything of the default grid."""
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "DEFAULT_OUT", default := tmp_path / "benchmark" / "results")
+    (tmp_path / "README.md").write_text("before\n<!-- results -->\nold\n<!-- end results -->\nafter\n")
+    scores = {"mean_return_100": [1, 2], "kl": [0.1, 0.2]}
+    for variant in ("ppo", "acppo", "of my own"):
+        make_run(default, variant, **scores)
+        make_run(tmp_path / "other", variant, "Pong", **scores)
+    call(monkeypatch, "--out", default)
+    made = contents(default)
+    for name in figures.FIGURES:
+        assert made[f"figures/{name}.png"].startswith(b"\x89PNG") and len(made[f"figures/{name}.png"]) > 10_000
+        assert b"</svg>" in made[f"figures/{name}.svg"]
+    assert made["tables.md"].decode() == figures.tables_text(default)
+    section = figures.results_section(default, tmp_path / "README.md")
+    assert "](benchmark/results/figures/score.png)" in section
+    readme = (tmp_path / "README.md").read_text()
+    assert readme == f"before\n<!-- results -->\n{section}<!-- end results -->\nafter\n"
+
+    call(monkeypatch, "--out", tmp_path / "other")
+    assert (tmp_path / "other" / "figures" / "kl.svg").exists()
+    assert contents(default) == made and (tmp_path / "README.md").read_text() == readme
+    shutil.rmtree(default / "runs")  # from the CSVs alone
+    call(monkeypatch, "--out", default)
+    assert contents(default) == {name: data for name, data in made.items() if not name.startswith("runs/")}
+    assert (tmp_path / "README.md").read_text() == readme
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--out", "nowhere"], "has neither runs nor their CSVs"),
+        (["--out", "empty"], "no run there has an iteration"),
+        (["--out", "foreign"], "has other columns"),
+        (["--out", "damaged"], "cannot be read"),
+        (["--out", "empty", "--readme", "plain.md"], "to write between"),
+        (["--out", "empty", "--readme", "nowhere.md"], "to write between"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty" / "runs").mkdir(parents=True)
+    for name, text in (("foreign", "a,b\n1,2\n"), ("damaged", ",".join(figures.RUN_COLUMNS) + "\nx,y,no number\n")):
+        (tmp_path / name).mkdir()
+        for file in ("runs.csv", "curves.csv"):
+            (tmp_path / name / file).write_text(text)
+    (tmp_path / "plain.md").write_text("<!-- end results --> <!-- results -->")
+    with pytest.raises(SystemExit) as exit_:
+        call(monkeypatch, *flags)
+    out, err = capsys.readouterr()
+    assert exit_.value.code == 2 and out == "" and err.count("\n") == 1 and said in err
+
+
+def test_the_results_in_the_repository_are_those_of_its_csvs():
+    if not (figures.DEFAULT_OUT / "curves.csv").exists():
+        pytest.skip("benchmark/results has no curves.csv yet")
+    if (parts := figures.split_readme(ROOT / "README.md")) is None:
+        pytest.skip("the README has no results section yet")
+    readme, section = (ROOT / "README.md").read_text(), figures.results_section(figures.DEFAULT_OUT)
+    assert readme == f"{figures.MARKERS[0]}\n{section}{figures.MARKERS[1]}".join(parts), "run benchmark/figures.py"
+    assert (figures.DEFAULT_OUT / "tables.md").read_text() == figures.tables_text(figures.DEFAULT_OUT)

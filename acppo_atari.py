@@ -116,7 +116,8 @@ class Args:
     eval_episodes: int = 10
     """whole games that are played and scored when the training is finished, without learning; 0 for none"""
     capture_video: bool = False
-    """record a whole game at the start, at each quarter of the training and at its end, in `videos/` of the run"""
+    """record a whole game, in `videos/` of the run: at the start, at each quarter of the training and at its end, or
+    with `--evaluate` one"""
     evaluate: str | None = None
     """directory of a run whose checkpoint is to play `--eval-episodes` games; nothing is trained"""
     resume: str | None = None
@@ -351,6 +352,8 @@ def evaluate(args: Args, agent: Agent, run: RunDirectory, state: dict) -> None:
     with run.reporting(), open(os.path.join(run.path, "eval.csv"), "a", newline="") as file:
         rows = [(state["global_step"], number, *game) for number, game in enumerate(games, start=1)]
         csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
+    if args.evaluate is not None and args.capture_video:  # a training has recorded its last agent already
+        record_game(args, agent, run, state["global_step"])
     run.save(state, Args(**state["args"]))  # so that a resumed run keeps these points
     print(f"{len(games)} games at step {state['global_step']:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
 

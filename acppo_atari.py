@@ -427,6 +427,7 @@ def train(
     status_line = StatusLine()
 
     while True:
+        stopwatch = Stopwatch()
         if args.capture_video and iteration in (args.num_iterations * quarter // 4 for quarter in range(5)):
             record_game(args, agent, run, global_step)
 
@@ -446,7 +447,7 @@ def train(
             break
 
         iteration += 1
-        stopwatch = Stopwatch()
+        stopwatch.lap("checkpoint")
         if args.anneal_lr:
             optimizer.param_groups[0]["lr"] = (1 - (iteration - 1) / args.num_iterations) * args.learning_rate
 

@@ -46,9 +46,17 @@ import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 NUM_STEPS = 128  # agent steps of each environment in one iteration (appendix A): the default of every contender
-PHASES = tuple(f"time/{phase}" for phase in "inference environment storage advantages update kl_pass logging".split())
+PHASES = tuple(
+    f"time/{phase}" for phase in "checkpoint inference environment storage advantages update kl_pass logging".split()
+)
 REST = "time/unaccounted"  # what an iteration takes beyond its phases
-OVERHEAD = ("time/storage", "time/advantages", "time/logging", REST)  # outside environment, network and optimizer
+OVERHEAD = (
+    "time/checkpoint",
+    "time/storage",
+    "time/advantages",
+    "time/logging",
+    REST,
+)  # outside environment, network and optimizer
 LIMITS = ("float32_gflops", "bfloat16_gflops", "emulator_steps_per_second")
 CSV_FIELDS = "date env_id contender commit torch cpu round job num_envs threads jobs warmup window".split()
 CSV_FIELDS += ["steps_per_second", "peak_mb", "time/first_iteration", "time/iteration", *PHASES, REST, *LIMITS]

@@ -1,0 +1,386 @@
+"""The thesis's experiments: a grid of variants × games × seeds, as many runs at once as there are cores for.
+
+    python benchmark/atari5.py                                       # the thesis's 30 runs, then its figures
+    python benchmark/atari5.py --seeds 1 --stop-at 200000            # the first 4 % of ten of them
+    python benchmark/atari5.py --address auto --out /shared/results  # on the nodes of a Ray cluster
+
+The same command again goes on where the last one stopped: finished runs are skipped, others resumed from their
+checkpoints. A run that fails is resumed once, then reported, and the rest goes on; the runs of a node that dies go on
+elsewhere; Ctrl-C leaves every run resumable. With a larger `--stop-at` the same curves become longer.
+
+Each run is one process of a script, started by a Ray task (`pip install -e '.[benchmark]'`). OUT/runs gets the runs'
+own directories, OUT/logs what each of them was started with and has printed. Exit status: 0 all done, 1 some failed,
+2 bad input, 130 interrupted.
+"""
+
+import contextlib
+import ctypes
+import fcntl
+import itertools
+import logging
+import math
+import os
+import platform
+import re
+import shlex
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import NoReturn
+
+import tyro
+
+# A line each: the script and its arguments, ε and c always among them, so that a checkpoint can be held against them
+VARIANTS = {
+    "ppo": ("ppo_atari.py", {"clip_coef": 0.1}),  # the thesis's two, chapter 4
+    "acppo": ("acppo_atari.py", {"clip_coef": 0.16, "c": 1.0}),
+    "ppo-wide": ("ppo_atari.py", {"clip_coef": 0.16}),  # is it the adaptation, or the width?
+    "product": ("acppo_atari.py", {"clip_coef": 0.1, "c": math.inf}),  # only the product is bounded; δ not yet matched
+    "acppo-c0.25": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.25}),  # sensitivity to c ...
+    "acppo-c0.5": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.5}),
+    "acppo-c2": ("acppo_atari.py", {"clip_coef": 0.16, "c": 2.0}),
+    "acppo-c4": ("acppo_atari.py", {"clip_coef": 0.16, "c": 4.0}),
+    "acppo-eps0.08": ("acppo_atari.py", {"clip_coef": 0.08, "c": 1.0}),  # ... and to ε, beside PPO's
+    "acppo-eps0.32": ("acppo_atari.py", {"clip_coef": 0.32, "c": 1.0}),
+    "ppo-eps0.05": ("ppo_atari.py", {"clip_coef": 0.05}),
+    "ppo-eps0.2": ("ppo_atari.py", {"clip_coef": 0.2}),
+}
+COMMON_FLAGS = ["--eval-episodes", "0"]  # the measure is the thesis's, the last 100 games of training
+SCRIPTS = Path(__file__).resolve().parent.parent
+LOCK_SECONDS = 60  # for the process of a dead task to end: an iteration, and its checkpoint
+PROGRESS = re.compile(r"step ([\d,]+) of [\d,]+, (\d+) SPS(?:, score (-?[\d.]+))?")  # what a script says each minute
+
+
+@dataclass
+class Args:
+    games: tuple[str, ...] = ("BattleZone", "DoubleDunk", "NameThisGame", "Phoenix", "Qbert")
+    """games, or whatever else the scripts take as `--env-id`; the default is Atari-5 (chapter 4)"""
+    seeds: tuple[int, ...] = (1, 2, 3)
+    """seeds of each variant on each game; all games of one seed come before the next"""
+    variants: tuple[str, ...] = ("ppo", "acppo")
+    """lines of the table VARIANTS in this file"""
+    total_timesteps: int = 5_000_000
+    """agent steps of each run; Atari shows 4 frames for each, so this is the thesis's 20M frames (chapter 4)"""
+    stop_at: int | None = None
+    """agent steps at which each run ends for now; the schedule stays that of the whole run"""
+    cpus_per_run: int = 1
+    """cores, and threads, of each run"""
+    out: Path = Path(__file__).resolve().parent / "results"
+    """directory for everything that comes of the grid; with `--address`, on a path that all nodes share"""
+    address: str | None = None
+    """Ray cluster to run on, host:port or `auto` (the one this machine belongs to), not the cores of this process"""
+    figures: bool = True
+    """draw the figures once all runs are done"""
+    dry_run: bool = False
+    """print what would be run, and run nothing"""
+
+    def check(self) -> None:
+        """Ends the program with status 2 at the first argument that cannot work."""
+        for name in ("games", "seeds", "variants"):
+            if not getattr(self, name):
+                refuse(f"--{name}", "give at least one")
+        for game in self.games:
+            if not re.fullmatch(r"\w[\w./:-]*", game):
+                refuse(f"--games {game!r}", "give names such as Phoenix, apart from each other")
+        for variant in self.variants:
+            if variant not in VARIANTS:
+                refuse(f"--variants {variant}", f"give any of {', '.join(VARIANTS)}")
+        if not all(0 <= seed < 2**64 for seed in self.seeds):
+            refuse(f"--seeds {' '.join(map(str, self.seeds))}", "give whole numbers from 0 to 2^64 - 1")
+        for name in ("total_timesteps", "stop_at", "cpus_per_run"):
+            if (given := getattr(self, name)) is not None and given < 1:
+                refuse(f"--{name.replace('_', '-')} {given}", "give a whole number above 0")
+        if self.address is None and self.cpus_per_run > available_cores():
+            refuse(f"--cpus-per-run {self.cpus_per_run}", f"this process may use {available_cores()} cores")
+        if self.address not in (None, "auto"):  # Ray itself would knock for minutes
+            host, _, port = self.address.rpartition(":")
+            try:
+                socket.create_connection((host, int(port)), timeout=5).close()
+            except (OSError, ValueError, OverflowError):
+                refuse(f"--address {self.address}", "no Ray cluster answers there; give host:port, or auto")
+
+
+def available_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def say(line: str) -> None:
+    """Writes to standard error, whatever has become of it: a terminal that is closed must not end the grid unclean."""
+    with contextlib.suppress(OSError):
+        print(line, file=sys.stderr, flush=True)
+
+
+def refuse(given: str, advice: str) -> NoReturn:
+    say(f"{given}: {advice}")
+    sys.exit(2)
+
+
+# ------------------------------------------------------------------------------------------------------- a run
+@dataclass
+class Run:
+    game: str
+    variant: str
+    seed: int
+    state: str = "queued"  # then running, done or failed
+    step: int = 0  # agent steps in its checkpoint when this call began
+    log_size: int = 0  # bytes, then
+    reason: str = ""  # that it failed for
+
+    @property
+    def name(self) -> str:
+        """What its directories' names begin with; the script adds `__` and the time."""
+        game = re.sub(r"[^\w.-]", "-", self.game)
+        return f"{game}__{self.variant}__{self.seed}"
+
+    def log(self, args: Args) -> Path:
+        return args.out / "logs" / f"{self.name}.log"
+
+    def checkpoint(self, args: Args) -> Path | None:
+        """Returns the checkpoint of its newest directory that has one: the others hold nothing to resume."""
+        return max((args.out / "runs").glob(f"{self.name}__*/checkpoint.pt"), default=None)
+
+    def command(self, args: Args) -> list[str]:
+        """Returns what starts it, or takes it further."""
+        script, flags = VARIANTS[self.variant]
+        if checkpoint := self.checkpoint(args):
+            which = {"resume": checkpoint.parent}
+        else:
+            identity = {"env_id": self.game, "seed": self.seed, "exp_name": self.variant}
+            which = {**flags, **identity, "log_dir": args.out / "runs", "total_timesteps": args.total_timesteps}
+        which["threads"] = args.cpus_per_run
+        if args.stop_at is not None:
+            which["stop_at"] = args.stop_at
+        words = [word for name, value in which.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+        return [sys.executable, str(SCRIPTS / script), *words, *COMMON_FLAGS]
+
+    def look(self, args: Args) -> None:
+        """Finds out how far it is, and whether what is there is this run: going on with another would mix two."""
+        self.log_size = self.log(args).stat().st_size if self.log(args).exists() else 0
+        if (checkpoint := self.checkpoint(args)) is None:
+            return
+        import torch  # takes seconds, so only where there is something to read
+
+        try:
+            saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
+            trained, self.step = saved["args"], saved["global_step"]
+            rollout = trained["num_envs"] * trained["num_steps"]
+        except Exception:  # whatever a file that is no checkpoint makes them raise
+            self.state, self.reason = "failed", f"{checkpoint} is damaged; move its directory away"
+            return
+        wanted = {"c": None, **VARIANTS[self.variant][1], "env_id": self.game, "seed": self.seed}  # PPO has no c
+        for name, value in {**wanted, "total_timesteps": args.total_timesteps}.items():
+            if (has := trained.get(name)) != value:
+                flag = f"--{name.replace('_', '-')}"
+                advice = f"not with {value}; move it away, or give another --out"
+                self.state, self.reason = "failed", f"{checkpoint.parent} is trained with {flag} {has}, {advice}"
+                return
+        if self.step >= min(args.total_timesteps // rollout * rollout, args.stop_at or math.inf):
+            self.state = "done"
+
+
+def tail(log: Path) -> str:
+    """Returns the last 4 kB of a log, or nothing where there is none yet."""
+    try:
+        with log.open("rb") as file:
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
+            return file.read().decode(errors="replace")
+    except OSError:
+        return ""
+
+
+# --------------------------------------------------------------------------------------- in a worker process of Ray
+def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
+    """Runs a run to its end, at most twice, and returns why it failed, or nothing. Ray calls it once more, on another
+    node, where this one has died.
+
+    The lock on the log keeps two processes off one run. It belongs to the open file, which the script inherits as its
+    output: it lasts until the task and the script are gone, whichever of them lives longer.
+    """
+    # Ray sets this for its workers; a run shall see what it would see without Ray
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    if omp_num_threads is not None:
+        environment["OMP_NUM_THREADS"] = omp_num_threads
+    with run.log(args).open("ab") as log:
+        deadline = time.monotonic() + LOCK_SECONDS
+        while True:
+            try:
+                fcntl.flock(log, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    return "another process is training it; call again when it has ended"
+                time.sleep(0.5)  # not a blocking flock: Ray's cancel could not end that
+        for _ in range(2):
+            command = run.command(args)  # now, as the lock is held and what there is to resume is whole
+            log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {platform.node()}$ {shlex.join(command)}\n".encode())
+            log.flush()
+            if (status := run_process(command, environment, log)) == 0:
+                return ""
+    words = [line for line in tail(run.log(args)).splitlines() if re.search(r"\w", line)][-1].strip(" │")
+    return f"exit status {status}: {words} (all of it in {run.log(args)})"
+
+
+def run_process(command: list[str], environment: dict[str, str], log) -> int:
+    """Runs a process that does not outlive this one, and returns its exit status."""
+    worker, libc = os.getpid(), ctypes.CDLL(None)
+
+    def die_with_worker() -> None:
+        # For a worker that is killed: one that ends by itself kills its children. SIGTERM has the script write a
+        # checkpoint, and the lock has the next attempt wait for it. 1 is PR_SET_PDEATHSIG, which Linux alone has.
+        if hasattr(libc, "prctl"):
+            libc.prctl(1, signal.SIGTERM)
+        if os.getppid() != worker:  # it died before the line above
+            os._exit(1)
+
+    # In a session of its own, so that Ctrl-C in the terminal reaches the driver alone: a script that got that and the
+    # SIGTERM below would take the second for "at once", and write no checkpoint
+    own = {"start_new_session": True, "preexec_fn": die_with_worker}
+    child = subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log, **own)
+    try:
+        while child.poll() is None:  # not wait(): Ray's cancel raises KeyboardInterrupt only between two calls
+            time.sleep(0.5)
+    finally:
+        if child.returncode is None:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ray may cancel once more
+            child.terminate()
+            child.wait()
+    return child.returncode
+
+
+# ----------------------------------------------------------------------------------------------------- the driver
+def run_grid(runs: list[Run], args: Args) -> None:
+    """Runs what is queued, to `done` or `failed`. Raises KeyboardInterrupt when interrupted, with all runs stopped."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
+    import ray
+
+    quiet = {"logging_level": logging.ERROR, "log_to_driver": False}
+    # "local" even where RAY_ADDRESS is set. Nothing is stored in the object store: near the least that Ray takes.
+    cores = {"num_cpus": available_cores(), "object_store_memory": 100_000_000, "include_dashboard": False}
+    pending = {}
+    try:
+        try:
+            ray.init(args.address or "local", **quiet, **({} if args.address else cores))
+        except (ConnectionError, ValueError) as error:
+            refuse(f"--address {args.address}", f"Ray does not start there ({str(error).splitlines()[0]})")
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # after init, which sets the second
+            if signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets the third
+                signal.signal(number, signal.default_int_handler)
+        most = max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])
+        if args.cpus_per_run > most:
+            refuse(f"--cpus-per-run {args.cpus_per_run}", f"no node has more than {most:.0f}")
+        # -1: a node's death is no fault of the run's
+        task = ray.remote(train).options(num_cpus=args.cpus_per_run, max_retries=-1)
+        omp = os.environ.get("OMP_NUM_THREADS")
+        for run in runs:
+            if run.state == "queued":
+                pending[task.remote(run, args, omp)] = run
+        progress = Progress(runs, args)
+        while pending:
+            progress.show()
+            for ref in ray.wait(list(pending), timeout=1)[0]:
+                run = pending.pop(ref)
+                try:
+                    run.reason = ray.get(ref)
+                except ray.exceptions.RayError as error:
+                    run.reason = str(error).strip().splitlines()[-1]  # of a traceback that crossed processes
+                run.state = "failed" if run.reason else "done"
+        progress.show()
+    except KeyboardInterrupt:
+        # Each task is told and awaited, because Ray kills the children of a worker that it shuts down with SIGKILL
+        if pending:
+            say("\nStopping: each run finishes its iteration and writes a checkpoint; once more ends at once")
+            for ref in pending:
+                ray.cancel(ref)
+            ray.wait(list(pending), num_returns=len(pending))
+        raise
+    finally:
+        ray.shutdown()
+
+
+class Progress:
+    """Shows how far the grid is on standard error: a table that updates in a terminal, a line a minute in a log."""
+
+    def __init__(self, runs: list[Run], args: Args):
+        self.runs, self.args = runs, args
+        self.drawn = 0  # lines of the table on the screen
+        self.due = time.monotonic() + 60
+
+    def show(self) -> None:
+        if not sys.stderr.isatty() and time.monotonic() < self.due:
+            return
+        self.due = time.monotonic() + 60
+        header, *rows = self.table()
+        if sys.stderr.isatty():
+            back = f"\x1b[{self.drawn}F\x1b[J" if self.drawn else ""  # up to the table's first line, and clear
+            say(back + "\n".join([header, *rows]))
+            self.drawn = 1 + len(rows)
+        else:
+            say("; ".join([header, *(" ".join(row.split()) for row in rows)]))
+
+    def table(self) -> list[str]:
+        """Returns a line on the grid, and one for each run that is running or has failed."""
+        goal = min(self.args.total_timesteps, self.args.stop_at or math.inf)
+        rows, steps_left, speed = [], 0, 0
+        for run in self.runs:
+            name = f"{run.game:15} {run.variant:14} seed {run.seed}"
+            if run.state == "failed":
+                rows.append(f"{name}  failed")
+            if run.state not in ("queued", "running"):
+                continue
+            step, score = run.step, ""
+            if (log := run.log(self.args)).exists() and log.stat().st_size > run.log_size:  # its task writes first
+                run.state = "running"
+                if said := PROGRESS.findall(tail(log)):
+                    step, sps, score = said[-1]
+                    step, speed = int(step.replace(",", "")), speed + int(sps)
+                rows.append(f"{name} {min(1, step / goal):5.0%}" + (f"  score {score}" if score else ""))
+            steps_left += max(0, goal - step)
+        states = [run.state for run in self.runs]
+        counts = ", ".join(f"{states.count(state)} {state}" for state in ("done", "running", "queued", "failed"))
+        left = f", {timedelta(seconds=round(steps_left / speed))} left" if speed else ""
+        return [f"{len(states)} runs: {counts}{left}", *rows]
+
+
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    args.check()
+    args.out = args.out.resolve()  # the tasks stand elsewhere
+    # Seed by seed, variants innermost, so that what is compared is complete early
+    grid = itertools.product(*map(dict.fromkeys, (args.seeds, args.games, args.variants)))  # each once
+    runs = [Run(game, variant, seed) for seed, game, variant in grid]
+    try:
+        for run in runs:
+            run.look(args)
+        if args.dry_run:
+            for run in runs:
+                todo = f"from step {run.step:,}: {shlex.join(run.command(args))}"
+                print(f"{run.name}: {run.reason or ('finished' if run.state == 'done' else todo)}")
+            sys.exit(any(run.state == "failed" for run in runs))
+        try:
+            for directory in ("runs", "logs"):
+                (args.out / directory).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            refuse(f"--out {args.out}", f"cannot be written ({error.strerror}); give another directory")
+        if any(run.state == "queued" for run in runs):
+            run_grid(runs, args)
+    except KeyboardInterrupt:
+        say(f"Stopped; go on with the same command: {shlex.join([sys.executable, *sys.argv])}")
+        sys.exit(130)
+    failed = [run for run in runs if run.state == "failed"]
+    for run in failed:
+        say(f"{run.name}: {run.reason}")
+    say(f"{len(runs) - len(failed)} of {len(runs)} runs are done, in {args.out}")
+    if failed:
+        sys.exit(1)
+    if args.figures:
+        figures = [sys.executable, str(Path(__file__).with_name("figures.py")), "--out", str(args.out)]
+        sys.exit(subprocess.run(figures).returncode != 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,259 @@
+"""The grid on real Ray: one command that is interrupted, called again, fails in part, and loses a node."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+import torch
+
+from benchmark import atari5
+from benchmark.atari5 import Args, Progress, Run
+from conftest import ROOT, scalars
+
+TOTAL = 20 * 1024  # agent steps: 20 rollouts, some seconds
+LONG = 3 * TOTAL
+GRID = ["--variants", "ppo", "acppo", "--seeds", "1", "--total-timesteps", str(TOTAL), "--no-figures"]
+
+
+def grid_command(out: Path, *flags: str) -> list[str]:
+    return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *flags]
+
+
+def call(out: Path, *flags: str) -> subprocess.CompletedProcess:
+    return subprocess.run(grid_command(out, *flags), capture_output=True, text=True, timeout=300)
+
+
+def start(out: Path, *flags: str) -> subprocess.Popen:
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(grid_command(out, *flags), start_new_session=True, **pipes)
+
+
+def both_log(out: Path) -> bool:
+    """Are two runs past their first iterations?"""
+    return len([path for path in (out / "runs").glob("*/events.*") if path.stat().st_size > 8000]) == 2
+
+
+def run_dirs(out: Path) -> dict[str, Path]:
+    """Returns each run's directory by the run's name; there may be one alone."""
+    directories = {path.name.rpartition("__")[0]: path for path in (out / "runs").iterdir()}
+    assert len(directories) == len(list((out / "runs").iterdir()))
+    return directories
+
+
+def global_step(run_dir: Path) -> int:
+    return torch.load(run_dir / "checkpoint.pt", weights_only=True)["global_step"]
+
+
+def steps(run_dir: Path) -> list[int]:
+    """Agent steps of what is logged once an iteration."""
+    return [step for step, _ in scalars(run_dir).get("charts/learning_rate", [])]
+
+
+def attempts(out: Path, name: str) -> list[str]:
+    """Returns the commands that a run was started with."""
+    return re.findall(r"^\d{4}-.*?\$ (.*)", (out / "logs" / f"{name}.log").read_text(), re.MULTILINE)
+
+
+def wait_for(condition, seconds: float = 120) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def processes(out: Path) -> dict[str, list[int]]:
+    """Returns the processes that train, by the name of their run."""
+    found = defaultdict(list)
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (process / "cmdline").read_bytes().decode().split("\0")
+        except OSError:  # it has just ended
+            continue
+        flags = dict(zip(words, words[1:]))
+        if "--resume" in flags and flags["--resume"].startswith(str(out)):
+            found[Path(flags["--resume"]).name.rpartition("__")[0]].append(int(process.name))
+        elif flags.get("--log-dir") == str(out / "runs"):
+            found[f"{flags['--env-id']}__{flags['--exp-name']}__{flags['--seed']}"].append(int(process.name))
+    return found
+
+
+# ------------------------------------------------------------------------------- one grid, interrupted and gone on with
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory):
+    """Interrupts the grid as Ctrl-C in a terminal does, then calls it again with a game that does not exist."""
+    out = tmp_path_factory.mktemp("grid")
+    driver = start(out, "--games", "CartPole-v1")
+    wait_for(lambda: both_log(out))
+    os.killpg(driver.pid, signal.SIGINT)
+    said = driver.communicate(timeout=60)[1]
+    interrupted = {name: (global_step(path), steps(path)) for name, path in run_dirs(out).items()}
+    left = processes(out)
+    return out, (driver.returncode, said, interrupted, left), call(out, "--games", "CartPole-v1", "Brekout")
+
+
+def test_an_interrupted_grid_leaves_every_run_at_a_checkpoint_of_its_last_step(grid):
+    _, (status, said, interrupted, left), _ = grid
+    assert status == 130 and "go on with the same command" in said
+    assert set(interrupted) == {"CartPole-v1__ppo__1", "CartPole-v1__acppo__1"} and not left
+    for saved, logged in interrupted.values():
+        assert 0 < saved < TOTAL and logged[-1] == saved
+
+
+def test_called_again_it_finishes_each_curve_without_a_gap_or_a_repetition(grid):
+    out, _, _ = grid
+    for name, run_dir in run_dirs(out).items():
+        assert steps(run_dir) == list(range(1024, TOTAL + 1, 1024)) and global_step(run_dir) == TOTAL
+        first, again = attempts(out, name)
+        assert "--resume" not in first and f"--resume {run_dir}" in again
+
+
+def test_a_run_that_always_fails_is_tried_twice_and_reported_while_the_rest_finishes(grid):
+    out, _, again = grid
+    assert again.returncode == 1
+    assert len(attempts(out, "Brekout__ppo__1")) == len(attempts(out, "Brekout__acppo__1")) == 2
+    reports = [line for line in again.stderr.splitlines() if "Brekout" in line]
+    assert [line.split(": ")[:2] for line in reports] == [
+        ["Brekout__ppo__1", "exit status 2"],
+        ["Brekout__acppo__1", "exit status 2"],
+    ]
+    assert "2 of 4 runs are done" in again.stderr
+
+
+def test_finished_runs_are_skipped_without_a_trace(grid):
+    out, _, _ = grid
+    before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*")}
+    again = call(out, "--games", "CartPole-v1")
+    assert (again.returncode, again.stderr) == (0, f"2 of 2 runs are done, in {out}\n")
+    assert before == {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*")}
+
+
+def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid):
+    out, _, _ = grid
+    other = call(out, "--games", "CartPole-v1", "--total-timesteps", "40960", "--dry-run")
+    assert other.returncode == 1 and other.stdout.count("trained with --total-timesteps 20480, not with 40960") == 2
+    for variant, difference in (("ppo", "--clip-coef 0.1, not with 0.16"), ("acppo", "--c 1.0, not with None")):
+        run_dir = run_dirs(out)[f"CartPole-v1__{variant}__1"]
+        renamed = run_dir.rename(run_dir.with_name(run_dir.name.replace(variant, "ppo-wide")))
+        wide = Run("CartPole-v1", "ppo-wide", 1)
+        wide.look(Args(out=out, total_timesteps=TOTAL))
+        renamed.rename(run_dir)
+        assert wide.state == "failed" and difference in wide.reason
+
+
+# ------------------------------------------------------------------------------------------------------- without Ray
+def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path):
+    flags = ("--games", "Phoenix", "Qbert", "--seeds", "1", "2", "2", "--stop-at", "5000", "--dry-run")
+    dry = call(tmp_path / "out", *flags)
+    assert (dry.returncode, dry.stderr) == (0, "") and not (tmp_path / "out").exists()
+    names = [line.split(":")[0] for line in dry.stdout.splitlines()]
+    assert names == [f"{g}__{v}__{s}" for s in (1, 2) for g in ("Phoenix", "Qbert") for v in ("ppo", "acppo")]
+    assert "acppo_atari.py --clip-coef 0.16 --c 1.0 --env-id Phoenix --seed 1" in dry.stdout.splitlines()[1]
+    assert dry.stdout.count(f"--total-timesteps {TOTAL} --threads 1 --stop-at 5000") == 8
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        ["--variants", "ppo", "acpo"],
+        ["--games"],
+        ["--games", "../Qbert"],
+        ["--seeds", "-1"],
+        ["--total-timesteps", "0"],
+        ["--stop-at", "-5"],
+        ["--cpus-per-run", "10000"],
+        ["--out", "/proc/nothing"],
+        ["--address", "127.0.0.1:1"],
+        ["--address", "nonsense"],
+    ],
+    ids=" ".join,
+)
+def test_what_cannot_work_is_refused_in_one_line(flags, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["atari5.py", *flags])
+    with pytest.raises(SystemExit) as ended:
+        atari5.main()
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and said.startswith(flags[0])
+
+
+def test_an_interrupted_directory_without_a_checkpoint_does_not_count(tmp_path):
+    (tmp_path / "runs" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
+    run = Run("Qbert", "ppo", 1)
+    run.look(Args(out=tmp_path))
+    assert run.state == "queued" and "--resume" not in run.command(Args(out=tmp_path))
+
+
+def test_the_table_shows_percent_score_and_time_left_from_the_logs(tmp_path):
+    args = Args(out=tmp_path, total_timesteps=10_000_000, stop_at=1_000_000)
+    runs = [Run(game, "ppo", 1) for game in ("Phoenix", "Qbert", "Pong")]
+    runs[2].state = "failed"
+    (tmp_path / "logs").mkdir()
+    runs[0].log(args).write_text(
+        "$ python\nstep 1,024 of 10,000,000, 500 SPS, 5:33:19 left\n"
+        "step 250,880 of 10,000,000, 400 SPS, score -12.5, 6:46:13 left\n"
+    )
+    header, *rows = Progress(runs, args).table()
+    assert header == "3 runs: 0 done, 1 running, 1 queued, 1 failed, 1:12:53 left"  # 1,749,120 steps at 400 a second
+    assert [" ".join(row.split()) for row in rows] == ["Phoenix ppo seed 1 25% score -12.5", "Pong ppo seed 1 failed"]
+
+
+# ------------------------------------------------------------------------------------ workers and nodes that are killed
+def finish(driver: subprocess.Popen, out: Path) -> list[str]:
+    """Waits for the grid's end, checks every run, and returns the names of those that were started twice."""
+    while driver.poll() is None:
+        assert all(len(found) == 1 for found in processes(out).values())  # none twice at once
+        time.sleep(0.05)
+    assert driver.returncode == 0, driver.communicate()
+    runs = run_dirs(out)
+    for run_dir in runs.values():
+        assert steps(run_dir) == list(range(1024, LONG + 1, 1024))
+    return [name for name in runs if len(attempts(out, name)) == 2]
+
+
+def resumed_at(run_dir: Path) -> int:
+    """Returns the step of the checkpoint that the second process of a run began with."""
+    first, second = sorted(run_dir.glob("events.*"), key=os.path.getmtime)
+    return steps(second)[0] - 1024
+
+
+@pytest.mark.slow
+def test_a_run_whose_worker_is_killed_writes_its_checkpoint_and_goes_on_from_there(tmp_path):
+    driver = start(tmp_path, "--games", "CartPole-v1", "--total-timesteps", str(LONG))
+    wait_for(lambda: both_log(tmp_path))
+    child = processes(tmp_path)["CartPole-v1__ppo__1"][0]
+    worker = int(Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[1])
+    reached = steps(run_dirs(tmp_path)["CartPole-v1__ppo__1"])[-1]
+    os.kill(worker, signal.SIGKILL)
+    assert finish(driver, tmp_path) == ["CartPole-v1__ppo__1"]
+    resumed = resumed_at(run_dirs(tmp_path)["CartPole-v1__ppo__1"])
+    print(f"its worker was killed when it was at step {reached}; it went on from step {resumed}")
+    assert resumed >= reached
+
+
+@pytest.mark.slow
+def test_a_killed_node_costs_time_and_nothing_else(tmp_path):
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
+    try:
+        node = cluster.add_node(num_cpus=1)
+        flags = ("--games", "CartPole-v1", "--seeds", "1", "2", "--total-timesteps", str(LONG))
+        driver = start(tmp_path, *flags, "--address", cluster.address)
+        wait_for(lambda: both_log(tmp_path))
+        reached = {name: steps(path)[-1] for name, path in run_dirs(tmp_path).items()}
+        killed = time.time()
+        cluster.remove_node(node, allow_graceful=False)
+        again = finish(driver, tmp_path)
+    finally:
+        cluster.shutdown()
+    assert len(run_dirs(tmp_path)) == 4 and len(again) == 1
+    run_dir = run_dirs(tmp_path)[again[0]]
+    waited = max(int(path.name.split(".")[3]) for path in run_dir.glob("events.*")) - killed
+    print(f"{again[0]} was at step {reached[again[0]]} when its node was killed.", end=" ")
+    print(f"After {waited:.0f} s it went on from step {resumed_at(run_dir)} on the other node.")

@@ -17,6 +17,8 @@ from wrappers import make_envs
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {"ppo": ppo_atari, "acppo": acppo_atari}
+# For tests that start many processes: tests/test_siblings.py sees to it that what they test is the same in both
+ONE_IN_THE_PLAIN_RUN = [acppo_atari, pytest.param(ppo_atari, marks=pytest.mark.slow)]
 MEASURED_IN_SECONDS = ("charts/SPS", "time/")  # what two equal runs do not share
 TINY_PIXELS = "tiny_envs:TinyPixels-v0"
 SHORT_CARTPOLE = "tiny_envs:ShortCartPole-v0"

@@ -13,19 +13,17 @@ import pytest
 import torch
 from gymnasium.vector import VectorWrapper
 
-import acppo_atari
 import tiny_envs
-from conftest import MEASURED_IN_SECONDS, ROOT, SHORT_CARTPOLE, TINY_PIXELS, run_script, scalars
+from conftest import MEASURED_IN_SECONDS, ONE_IN_THE_PLAIN_RUN, ROOT, SHORT_CARTPOLE, TINY_PIXELS, run_script, scalars
 from wrappers import RecordVideo, env_seeds, make_envs
 
 
-@pytest.fixture
-def script():
-    """One of the two is enough: that they are the same but for the clip range is tests/test_siblings.py's to see."""
-    return acppo_atari
-
-
 SMALL = ["--num-envs", "4", "--num-steps", "32", "--threads", "1"]
+
+
+@pytest.fixture(params=ONE_IN_THE_PLAIN_RUN, ids=["acppo", "ppo"])
+def script(request):
+    return request.param
 
 
 def agent_for(script, env_id: str):

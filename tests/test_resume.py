@@ -19,11 +19,17 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tbparse import SummaryReader
 
-from conftest import SCRIPTS, TINY_PIXELS, run_script, scalars, values
+from conftest import ONE_IN_THE_PLAIN_RUN, SCRIPTS, TINY_PIXELS, run_script, scalars, values
 from wrappers import make_envs
+
 
 SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
 EVERY_ITERATION = "charts/learning_rate"
+
+
+@pytest.fixture(params=ONE_IN_THE_PLAIN_RUN, ids=["acppo", "ppo"])
+def script(request):
+    return request.param
 
 
 def flags_of(**arguments) -> list[str]:

@@ -17,7 +17,6 @@ import tiny_envs
 from conftest import MEASURED_IN_SECONDS, ONE_IN_THE_PLAIN_RUN, ROOT, SHORT_CARTPOLE, TINY_PIXELS, run_script, scalars
 from wrappers import RecordVideo, env_seeds, make_envs
 
-
 SMALL = ["--num-envs", "4", "--num-steps", "32", "--threads", "1"]
 
 

@@ -22,7 +22,6 @@ from tbparse import SummaryReader
 from conftest import ONE_IN_THE_PLAIN_RUN, SCRIPTS, TINY_PIXELS, run_script, scalars, values
 from wrappers import make_envs
 
-
 SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
 EVERY_ITERATION = "charts/learning_rate"
 

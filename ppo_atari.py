@@ -12,7 +12,6 @@ whole of AC-PPO, and a change to one is a change to both.
 Sections: arguments, network, mathematics, playing, training, command line.
 """
 
-import csv
 import ctypes
 import math
 import os
@@ -146,20 +145,22 @@ class Args:
         sizes = "total_timesteps num_envs num_steps num_minibatches update_epochs"
         rules = [  # 1e30: float32 must hold what is computed with it
             (sizes, lambda x: x > 0, "give a whole number above 0"),
-            ("learning_rate clip_coef vf_clip_coef max_grad_norm", lambda x: 0 < x < 1e30, "give a finite one above 0"),
-            ("ent_coef vf_coef checkpoint_minutes eval_episodes", lambda x: 0 <= x < 1e30, "give a finite 0 or above"),
+            ("clip_coef vf_clip_coef", lambda x: 0 < x < 1e30, "give a finite number above 0"),
+            ("learning_rate max_grad_norm", lambda x: 0 < x < 1e30, "give a finite number above 0"),
+            ("ent_coef vf_coef checkpoint_minutes", lambda x: 0 <= x < 1e30, "give a finite number, 0 or above"),
+            ("eval_episodes", lambda x: 0 <= x <= 1_000_000, "give a whole number from 0 to 1,000,000"),
             ("gamma gae_lambda", lambda x: 0 <= x <= 1, "give a number from 0 to 1"),
             ("target_kl stop_at", lambda x: x is None or x > 0, "give a number above 0, or None"),
             ("seed", lambda x: 0 <= x < 2**64, "give a whole number from 0 to 2^64 - 1"),
             ("threads", lambda x: 0 < x <= most_threads, f"give a number from 1 to {most_threads}"),
             ("exp_name", lambda x: re.fullmatch(r"[\w.-]{1,100}", x), "give up to 100 letters, digits, '.', '_', '-'"),
             ("compile", lambda x: not x or shutil.which(compiler), f"there is no C++ compiler {compiler}"),
-            ("num_steps", lambda x: self.batch_size <= 1_000_000, "give at most 1,000,000 samples a rollout"),
+            ("num_steps", lambda x: self.batch_size <= 1_000_000, "give a rollout of at most 1,000,000 samples"),
             ("total_timesteps", lambda x: x >= self.batch_size, f"give at least one rollout, {rollout}"),
             ("num_minibatches", lambda x: self.batch_size % x == 0, f"give a divisor of {rollout}"),
-            ("num_minibatches", lambda x: x < self.batch_size or not self.norm_adv, "one sample cannot be normalised"),
-            ("evaluate", lambda x: x is None or self.eval_episodes > 0, "give --eval-episodes above 0, too"),
+            ("num_minibatches", lambda x: x < self.batch_size or not self.norm_adv, "give fewer, or --no-norm-adv"),
             ("evaluate", lambda x: x is None or self.resume is None, "give either this or --resume"),
+            ("evaluate", lambda x: x is None or self.eval_episodes > 0, "give --eval-episodes above 0, too"),
         ]
         for names, works, advice in rules:
             for name in names.split():
@@ -314,14 +315,16 @@ def play(agent: Agent, envs: VectorEnv, num_games: int, seed: list[int]) -> list
     """Plays whole games as in training, actions drawn from the policy, and returns (score, agent steps) of each.
 
     Each environment plays a fixed share of them: of those that end first, too many would be short. All that is random
-    comes from `seed`, so that a training is not disturbed.
+    comes from `seed`, so that a training is not disturbed. Games that do not end are left out.
     """
     device = next(agent.parameters()).device
     generator = torch.Generator(device).manual_seed(seed[0])
     obs, _ = envs.reset(seed=env_seeds(seed, envs.num_envs))
     games = [[] for _ in range(envs.num_envs)]
     shares = [len(range(n, num_games, envs.num_envs)) for n in range(envs.num_envs)]
-    while any(len(played) < share for played, share in zip(games, shares, strict=True)):
+    steps_left = 27_000 * max(shares)  # Atari's longest games; other environments may have no time limit
+    while steps_left > 0 and any(len(played) < share for played, share in zip(games, shares, strict=True)):
+        steps_left -= 1
         actions, _, _ = act(agent, from_envs(obs, device), generator)
         obs, _, _, _, infos = envs.step(actions.cpu().numpy())
         for n in np.flatnonzero(infos.get("_episode", False)):
@@ -334,16 +337,14 @@ def evaluate(args: Args, agent: Agent, run: RunDirectory, state: dict) -> None:
     torch.set_num_threads(args.threads)
     envs = make_envs(args.env_id, min(args.num_envs, args.eval_episodes), args.threads)
     games = play(agent, envs, args.eval_episodes, seed=[args.seed, 1])
-    scores = np.array([score for score, _ in games])
+    if len(games) < args.eval_episodes:
+        say(f"{args.eval_episodes - len(games)} of {args.eval_episodes} games did not end, they are left out")
+    scores = np.array([score for score, _ in games] or [math.nan])
     std = scores.std(ddof=1) if len(scores) > 1 else 0.0
     stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
-    run.log([(f"eval/{name}", value, state["global_step"]) for name, value in stats.items()])
-    with run.reporting(), open(os.path.join(run.path, "eval.csv"), "a", newline="") as file:
-        rows = [(state["global_step"], number, *game) for number, game in enumerate(games, start=1)]
-        csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
+    run.log_games(games, stats, state)
     if args.evaluate is not None and args.capture_video:  # a training has recorded its last agent already
         record_game(args, agent, run, state["global_step"])
-    run.save(state, Args(**state["args"]))  # so that a resumed run keeps these points
     print(f"{len(games)} games at step {state['global_step']:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
 
 
@@ -353,7 +354,7 @@ def record_game(args: Args, agent: Agent, run: RunDirectory, global_step: int) -
     with run.reporting():
         os.makedirs(os.path.dirname(path), exist_ok=True)
         envs = make_envs(args.env_id, 1, args.threads, video=path + ".webm")
-        ((score, _),) = play(agent, envs, 1, seed=[args.seed, 2])
+        score = sum(score for score, _ in play(agent, envs, 1, seed=[args.seed, 2]))
         envs.close()
         os.replace(path + ".webm", f"{path}_score_{score:.10g}.webm")
 
@@ -383,6 +384,8 @@ def train(
         with run.loading():
             agent.load_state_dict(state["agent"])
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
+            for parameter, moments in optimizer.state.items():
+                assert parameter.shape == moments["exp_avg"].shape == moments["exp_avg_sq"].shape
             iteration, global_step, seconds_before = state["iteration"], state["global_step"], state["seconds"]
             starts = state["starts"]
             last_scores.extend(state["last_scores"])
@@ -417,21 +420,18 @@ def train(
 
     while True:
         stopwatch = Stopwatch()
-        if args.capture_video and iteration in (args.num_iterations * quarter // 4 for quarter in range(5)):
-            record_game(args, agent, run, global_step)
-
         # Checkpoint: when due, and at the end
-        finished = iteration >= args.last_iteration
-        if finished:
-            stop.number = 0  # a signal now comes too late to stop anything
-        finished = finished or stop.number != 0
+        finished = iteration >= args.last_iteration or stop.number != 0
         if finished or time.perf_counter() >= checkpoint_due:
             seconds = seconds_before + time.perf_counter() - started
             where = {"iteration": iteration, "global_step": global_step, "seconds": seconds, "starts": starts + 1}
             learnt = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"]}
             rng = [torch.get_rng_state(), *([torch.cuda.get_rng_state()] if device.type == "cuda" else [])]
-            run.save({**where, **learnt, "rng": rng, "last_scores": list(last_scores)}, args)
+            scores = {"last_scores": list(last_scores)}
+            run.save({"args": vars(args), **where, **learnt, **scores, "rng": rng})
             checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
+        if args.capture_video and not stop.number and iteration in [args.num_iterations * k // 4 for k in range(5)]:
+            record_game(args, agent, run, global_step)
         if finished:
             break
 
@@ -535,7 +535,8 @@ def train(
         broken = [name for name, value in losses.items() if not math.isfinite(value)]
         broken += [name for name, parameter in agent.named_parameters() if not parameter.isfinite().all()]
         if broken:  # before the checkpoint that would keep it
-            sys.exit(f"{run.path}: not finite in iteration {iteration}, step {global_step}: {', '.join(broken)}")
+            say(f"{run.path}: not finite in iteration {iteration}, step {global_step}: {', '.join(broken)}")
+            sys.exit(1)
         losses["explained_variance"] = explained_variance.item()  # may be NaN
         del losses["ratio"]  # its approx_kl, whose mean over minibatches is no curve of its own
         points += [(f"losses/{name}", value, global_step) for name, value in losses.items()]
@@ -561,16 +562,14 @@ def main() -> None:
     threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
     args, state, stop = tyro.cli(Args), None, StopSignal()
     stop.listen()
-    directory, flag = args.resume or args.evaluate, "resume" if args.evaluate is None else "evaluate"
+    flag = "evaluate" if args.resume is None else "resume"
+    directory = getattr(args, flag)
     if directory is not None:
-        try:
-            run = RunDirectory(directory)
-            state = run.load(Args)
-        except BlockingIOError:
-            refuse(flag, directory, "another process is training there; wait for its end")
-        except (OSError, ValueError) as error:
-            refuse(flag, directory, getattr(error, "strerror", None) or error)
-        args = tyro.cli(Args, default=replace(Args(**state["args"]), resume=args.resume, evaluate=args.evaluate))
+        run, state = RunDirectory.open(directory, flag, Args)
+        given = {"resume": args.resume, "evaluate": args.evaluate}
+        if flag == "evaluate":  # these are the call's, not the run's
+            given |= {name: getattr(Args(), name) for name in ("capture_video", "compile", "eval_episodes", "threads")}
+        args = tyro.cli(Args, default=replace(Args(**state["args"]), **given))
         for name in ("env_id", "num_envs", "num_steps", "seed", "exp_name", "log_dir"):
             if getattr(args, name) != state["args"][name]:
                 refuse(name, getattr(args, name), f"the run has {state['args'][name]}, which cannot change")
@@ -580,28 +579,28 @@ def main() -> None:
         print(f"{args.resume} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")
         return
     try:
-        envs = make_envs(args.env_id, args.num_envs, num_threads=args.threads)
+        envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
         if args.capture_video:
             make_envs(args.env_id, 1, video="none yet")  # refused now, if it cannot be rendered
     except ValueError as error:
         refuse("env_id", args.env_id, error)
     if state is None:
-        try:
-            run = RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
-        except OSError as error:
-            refuse("log_dir", args.log_dir, f"cannot be written ({error.strerror}); give another directory")
+        run = RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
     if args.evaluate is None:
         agent = train(args, envs, run, state, stop)
     else:
         agent, _ = make_agent(args, envs)
         with run.loading("evaluate"):
             agent.load_state_dict(state["agent"])
-    if stop.number:
+    stop.listen(signal.SIG_DFL)  # there is nothing left to save
+    state = state if run.failed else run.load(Args)
+    if stop.number and not run.failed and state["iteration"] < args.last_iteration:
         say(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path])}")
-    elif not run.failed and args.eval_episodes > 0 and (args.evaluate or args.last_iteration == args.num_iterations):
-        stop.listen(signal.SIG_DFL)  # there is nothing left to save
-        evaluate(args, agent, run, run.load(Args))
-    sys.exit(1 if run.failed else 128 + stop.number if stop.number else 0)
+        sys.exit(128 + stop.number)
+    finished = args.last_iteration == args.num_iterations and not stop.number and not run.failed
+    if args.evaluate is not None or (finished and args.eval_episodes > 0):
+        evaluate(args, agent, run, state)
+    sys.exit(1 if run.failed else 0)
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ Nothing in this file knows the algorithm, and nothing of the algorithm stands ou
 """
 
 import contextlib
+import csv
 import difflib
 import fcntl
 import importlib.metadata
@@ -140,6 +141,7 @@ class RecordVideo(VectorWrapper):
         screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed)[0][0, 0]
         import cv2  # here, because it changes the environment variables of whoever imports it
 
+        self.screens = 0  # written
         with silent():  # about a tag that WebM does without
             vp9 = cv2.VideoWriter_fourcc(*"VP90")
             self.video = cv2.VideoWriter(self.path, cv2.CAP_FFMPEG, vp9, self.fps, screen.shape[1::-1])
@@ -162,12 +164,23 @@ class RecordVideo(VectorWrapper):
 
     def write(self, screen: np.ndarray) -> None:
         if self.video is not None:
+            self.screens += 1
             self.video.write(np.ascontiguousarray(screen[..., ::-1]))  # OpenCV takes blue first
 
     def finish(self) -> None:
-        if self.video is not None:
-            self.video.release()
+        """Ends the file. Raises OSError where it is not whole, which OpenCV does not say: the disk may be full."""
+        if self.video is None:
+            return
+        self.video.release()
         self.video = None
+        import cv2
+
+        with silent():
+            file, readable = cv2.VideoCapture(self.path), 0
+            while file.grab():
+                readable += 1
+        if readable != self.screens:
+            raise OSError(f"{self.path} ends after {readable} of {self.screens} pictures")
 
     def close(self, **kwargs):
         self.finish()
@@ -289,7 +302,8 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
     except UnsupportedSpace:
         raise
     except Exception as error:  # whatever a foreign constructor raises
-        raise ValueError(f"it cannot be built: {error or type(error).__name__}") from error
+        verb = "built" if video is None else "rendered"
+        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}") from error
     if video is not None:
         envs = RecordVideo(envs, video, envs.metadata.get("render_fps", 30))
     return RecordEpisodeStatistics(envs)
@@ -355,23 +369,42 @@ class RunDirectory:
     def make(cls, args) -> "RunDirectory":
         """Makes a new run's directory in `args.log_dir`; a name that is taken moves on to the next second."""
         name = re.sub(r"[^\w.-]", "-", args.env_id)
-        for second in itertools.count(int(time.time())):
-            path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
-            with contextlib.suppress(FileExistsError):
-                os.makedirs(path)
-                return cls(path)
+        try:
+            for second in itertools.count(int(time.time())):
+                path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
+                with contextlib.suppress(FileExistsError):
+                    os.makedirs(path)
+                    return cls(path)
+        except OSError as error:
+            refuse("log_dir", args.log_dir, f"cannot be written ({error.strerror}); give another directory")
+
+    @classmethod
+    def open(cls, path: str, flag: str, args_class: type) -> tuple["RunDirectory", dict]:
+        """Returns the run in a directory that was given as `flag`, and its checkpoint; see `load`."""
+        try:
+            run = cls(path)
+            return run, run.load(args_class)
+        except BlockingIOError:
+            refuse(flag, path, "another process holds it; wait for its end")
+        except (OSError, ValueError) as error:
+            refuse(flag, path, getattr(error, "strerror", None) or error)
 
     def describe(self, args, step: int) -> None:
         """Writes what the run is to `args.json`, and as text to TensorBoard, with the layout of its custom scalars."""
-        about = {"command": command_line(args), "args": saved_args(args), "provenance": provenance()}
-        with self.reporting(), open(os.path.join(self.path, "args.json"), "w") as file:
-            json.dump(about, file, indent=2)
+        about = {"command": command_line(args), "args": saved_args(vars(args)), "provenance": provenance()}
+        path = os.path.join(self.path, "args.json")
+        with self.reporting():
+            with open(path + ".new", "w") as file:
+                json.dump(about, file, indent=2)
+            os.replace(path + ".new", path)
         with self.logging():
             self.writer = SummaryWriter(self.path)
             self.writer.add_custom_scalars(LAYOUT)
-            for tag, rows in (("hyperparameters", about["args"]), ("provenance", about["provenance"])):
+            provenance_rows = {"command": about["command"], **about["provenance"]}
+            for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
                 table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
                 self.writer.add_text(tag, "\n".join(table), step)
+            self.writer.flush()
 
     def log(self, points: list[tuple]) -> None:
         """Writes (tag, value, agent step) to TensorBoard."""
@@ -381,6 +414,17 @@ class RunDirectory:
                 for point in points:
                     self.writer.add_scalar(*point)
                 self.writer.flush()
+
+    def log_games(self, games: list[tuple[float, int]], stats: dict[str, float], state: dict) -> None:
+        """Writes the games that the agent of checkpoint `state` has played to `eval.csv`, and `eval/…` statistics."""
+        before, step = self.event_files(), state["global_step"]
+        self.log([(f"eval/{name}", value, step) for name, value in stats.items()])
+        with self.reporting(), open(os.path.join(self.path, "eval.csv"), "a", newline="") as file:
+            rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
+            csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
+        # So that a resumed run keeps these points, and is still rid of others after the checkpoint
+        grown = {name: size for name, size in self.event_files().items() if size != before.get(name)}
+        self.save({**state, "event_files": {**state["event_files"], **grown}})
 
     @contextlib.contextmanager
     def logging(self) -> Iterator[None]:
@@ -399,12 +443,12 @@ class RunDirectory:
         except OSError as error:
             self.report(error)
 
-    def save(self, state: dict, args) -> None:
+    def save(self, state: dict) -> None:
         """Writes a checkpoint beside the last one and renames it over: at every instant one of the two is whole."""
         new = self.checkpoint + ".new"
         try:
             with open(new, "wb") as file:
-                torch.save({**state, "args": saved_args(args), "event_files": self.event_files()}, file)
+                torch.save({"event_files": self.event_files(), **state, "args": saved_args(state["args"])}, file)
             for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
                 with open(name, "rb+") as file:  # on the disk before the rename is, also if the power fails
                     os.fsync(file.fileno())
@@ -418,7 +462,7 @@ class RunDirectory:
 
     def report(self, error: Exception) -> None:
         if not self.failed:
-            say(f"{self.path}: {error}; training goes on, what cannot be written is lost")
+            say(f"{self.path}: {error}; the run goes on, what cannot be written is lost")
         self.failed = True
 
     def load(self, args_class: type) -> dict:
@@ -433,11 +477,16 @@ class RunDirectory:
             whole &= {type(state[name]) for name in ("iteration", "global_step", "starts")} == {int}
             whole &= {float} == {type(number) for number in (state["seconds"], *state["last_scores"])}
             whole &= state["global_step"] == state["iteration"] * args["num_envs"] * args["num_steps"]
-            whole &= all(isinstance(value, hints.get(name, ())) for name, value in args.items())
+            whole &= state["iteration"] >= 0 and 0 <= state["starts"] < 10**6
+            whole &= all(tensor.isfinite().all().item() for tensor in state["agent"].values())
+            others = args.keys() ^ (hints.keys() - OF_ONE_CALL)
+            whole &= all(isinstance(value, hints[name]) for name, value in args.items() if name not in others)
         except Exception as error:  # whatever a file that is no checkpoint makes them raise
             raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
-        if not whole or args.keys() != hints.keys() - OF_ONE_CALL:
-            raise ValueError("its checkpoint is damaged, or of another script")
+        if others:
+            raise ValueError(f"its checkpoint is of another script, which differs in {', '.join(sorted(others))}")
+        if not whole:
+            raise ValueError("its checkpoint is damaged")
         return state
 
     @contextlib.contextmanager
@@ -466,12 +515,12 @@ class StopSignal:
     def listen(self, handler=None) -> None:
         """From here on; `signal.SIG_DFL` gives the signals back to the system."""
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, handler or self.note)
+            signal.signal(number, self.note if handler is None else handler)
 
     def note(self, number: int, frame: object) -> None:
         self.number = number
         self.listen(signal.SIG_DFL)
-        say("\nStopping after this iteration, with a checkpoint; once more ends at once")
+        say("Stopping after this iteration, with a checkpoint; once more ends at once")
 
 
 class StatusLine:
@@ -482,27 +531,28 @@ class StatusLine:
 
     def show(self, line: str, last: bool) -> None:
         if sys.stderr.isatty():
-            say(f"\r{line:<79}", end="\n" if last else "")
+            say(line, end="\n" if last else "")
         elif time.perf_counter() >= self.due:
             say(line)
-            self.due += 60
+            self.due = time.perf_counter() + 60
 
 
 def say(text: str, end: str = "\n") -> None:
     """Writes to standard error, whatever has become of it: the end of a pipe or a full disk must not end the run."""
+    start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over the status line
     with contextlib.suppress(OSError):
-        os.write(2, (text + end).encode())
+        os.write(2, (start + text + end).encode())
 
 
-def saved_args(args) -> dict[str, object]:
+def saved_args(args: dict[str, object]) -> dict[str, object]:
     """Returns the arguments that belong to the run, not to one call of it."""
-    return {name: value for name, value in vars(args).items() if name not in OF_ONE_CALL}
+    return {name: value for name, value in args.items() if name not in OF_ONE_CALL}
 
 
 def command_line(args) -> str:
     """Returns the command that repeats the run: what is not the default, and what decides most in any case."""
-    words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], saved_args(type(args)())
-    for name, value in saved_args(args).items():
+    words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], saved_args(vars(type(args)()))
+    for name, value in saved_args(vars(args)).items():
         if value != defaults[name] or name in ("env_id", "seed", "threads"):
             words.append(f"--{'no-' if value is False else ''}{name.replace('_', '-')}")
             words += [] if isinstance(value, bool) else [str(value)]

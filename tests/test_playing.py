@@ -3,8 +3,12 @@
 import csv
 import json
 import os
+import resource
 import shlex
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 
 import cv2
@@ -131,7 +135,7 @@ def test_a_video_of_atari_shows_the_game_that_the_agent_plays(script, tmp_path):
 def test_what_cannot_be_rendered_is_refused_before_a_run_begins(script, tmp_path, monkeypatch, call_main):
     monkeypatch.chdir(tmp_path)
     status, _, said = call_main(script, "--env-id", TINY_PIXELS, "--capture-video")
-    assert status == 2 and said.count("\n") == 1 and "unexpected keyword argument 'render_mode'" in said
+    assert status == 2 and said.count("\n") == 1 and "it cannot be rendered" in said
     monkeypatch.setattr(tiny_envs.RenderedPixels, "render", lambda self: None)
     status, _, said = call_main(script, "--env-id", "tiny_envs:RenderedPixels-v0", "--capture-video")
     assert status == 2 and said.count("\n") == 1 and "no video can be made of it" in said
@@ -161,13 +165,61 @@ def test_a_checkpoint_is_evaluated_and_the_run_goes_on_after_it(script, tmp_path
     assert [step for step, _ in scalars(run_dir)["eval/mean"]] == [256, 256, 512]
 
 
+def test_a_killed_run_that_is_evaluated_is_still_rid_of_what_it_logged_after_its_checkpoint(script, tmp_path):
+    flags = ["--env-id", "CartPole-v1", "--total-timesteps", "1280", *SMALL]
+    assert run_script(script, *flags, "--stop-at", "256", cwd=tmp_path).returncode == 0
+    (run_dir,) = (tmp_path / "runs").iterdir()
+    kept = (run_dir / "checkpoint.pt").read_bytes()
+    assert run_script(script, "--resume", str(run_dir), "--stop-at", "512", cwd=tmp_path).returncode == 0
+    (run_dir / "checkpoint.pt").write_bytes(kept)  # as if the process had been killed before its next checkpoint
+    assert run_script(script, "--evaluate", str(run_dir), "--eval-episodes", "2", cwd=tmp_path).returncode == 0
+    assert run_script(script, "--resume", str(run_dir), "--stop-at", "640", cwd=tmp_path).returncode == 0
+    logged = scalars(run_dir)
+    assert [step for step, _ in logged["charts/learning_rate"]] == [128, 256, 384, 512, 640]
+    assert [step for step, _ in logged["eval/mean"]] == [256]
+
+
+def test_a_signal_ends_an_evaluation_at_once(script, tmp_path):
+    flags = ["--env-id", "tiny_envs:Endless-v0", "--total-timesteps", "128", *SMALL]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
+    process = subprocess.Popen([sys.executable, script.__file__, *flags], cwd=tmp_path, env=environment)
+    deadline = time.monotonic() + 120
+    while not any(torch.load(path)["iteration"] for path in tmp_path.glob("runs/*/checkpoint.pt")):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    time.sleep(2)  # its games, of 27,000 steps each, take longer
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=10) == -signal.SIGTERM
+
+
+def test_games_that_do_not_end_are_left_out(script, monkeypatch):
+    envs = make_envs("tiny_envs:Endless-v0", 2)
+    steps = []
+    monkeypatch.setattr(script, "act", lambda agent, obs, generator: (steps.append(1) or torch.zeros(2).long(), 0, 0))
+    assert script.play(agent_for(script, "tiny_envs:Endless-v0"), envs, 2, seed=[1, 1]) == []
+    assert len(steps) == 27_000
+
+
+def test_a_video_that_the_disk_has_no_room_for_is_reported(script, tmp_path):
+    flags = ["--env-id", "Breakout", "--total-timesteps", "128", *SMALL, "--capture-video", "--eval-episodes", "0"]
+    run = subprocess.run(
+        [sys.executable, script.__file__, *flags, "--checkpoint-minutes", "60"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, 8_000)),
+    )
+    assert run.returncode == 1 and run.stderr.count("\n") == 1 and "the run goes on" in run.stderr
+    assert not list(tmp_path.glob("runs/*/videos/*score*"))
+
+
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
         (["--evaluate", "nowhere"], "--evaluate nowhere: No such file or directory"),
         (["--evaluate", "RUN", "--resume", "RUN"], "give either this or --resume"),
         (["--evaluate", "RUN", "--eval-episodes", "0"], "give --eval-episodes above 0, too"),
-        (["--eval-episodes", "-1"], "--eval-episodes -1: give a finite 0 or above"),
+        (["--eval-episodes", "-1"], "--eval-episodes -1: give a whole number from 0"),
     ],
 )
 def test_an_evaluation_that_cannot_be_is_refused(script, flags, said, tmp_path, monkeypatch, call_main):
@@ -222,4 +274,5 @@ def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, tmp_pat
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     line.show("a", last=False)
     line.show("b", last=True)
-    assert capfd.readouterr().err == f"\r{'a':<79}\r{'b':<79}\n"
+    clear = "\r\x1b[K"
+    assert capfd.readouterr().err == f"{clear}a{clear}b\n"

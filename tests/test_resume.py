@@ -1,6 +1,7 @@
 """A run is never lost: checkpoints, resuming, signals, and faults that are provoked for real."""
 
 import json
+import math
 import os
 import random
 import re
@@ -85,7 +86,7 @@ def test_adams_moments_and_the_random_state_survive(script, tmp_path):
         assert moments.keys() == {"step", "exp_avg", "exp_avg_sq"}
         assert all(torch.equal(value, after["optimizer"][index][name]) for name, value in moments.items())
     assert all(torch.equal(value, after["agent"][name]) for name, value in before["agent"].items())
-    assert torch.equal(before["rng"], after["rng"])
+    assert len(before["rng"]) == len(after["rng"]) and all(map(torch.equal, before["rng"], after["rng"]))
     assert before["last_scores"] == after["last_scores"] and len(before["last_scores"]) > 0
     assert (before["starts"], after["starts"]) == (1, 2)
 
@@ -206,7 +207,7 @@ def test_the_run_of_the_other_script_is_refused(script, finished_runs, tmp_path,
     (other,) = set(SCRIPTS.values()) - {script}
     run_dir = shutil.copytree(finished_runs(other), tmp_path / "other")
     status, _, said = call_main(script, "--resume", str(run_dir))
-    assert (status, said) == (2, f"--resume {run_dir}: its checkpoint is damaged, or of another script\n")
+    assert (status, said) == (2, f"--resume {run_dir}: its checkpoint is of another script, which differs in c\n")
 
 
 @pytest.mark.parametrize("contents", [None, b"", b"no zip file"])
@@ -253,6 +254,10 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
     [
         lambda state: {**state, "args": {**state["args"], "learning_rate": "fast"}},
         lambda state: {**state, "agent": {"weight": torch.zeros(2)}},
+        lambda state: {**state, "agent": {name: value * math.nan for name, value in state["agent"].items()}},
+        lambda state: {**state, "optimizer": {0: {**state["optimizer"][0], "exp_avg": torch.zeros(3)}}},
+        lambda state: {**state, "starts": -1},
+        lambda state: {**state, "starts": 10**12},
         lambda state: {name: value for name, value in state.items() if name != "rng"},
         lambda state: {name: value for name, value in state.items() if name != "starts"},
         lambda state: {name: value for name, value in state.items() if name != "global_step"},
@@ -267,6 +272,10 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
     ids=[
         "a number as text",
         "another network",
+        "parameters that are not finite",
+        "moments of another shape",
+        "fewer starts than none",
+        "more starts than there can be",
         "no rng",
         "no starts",
         "no global_step",
@@ -292,7 +301,7 @@ def test_two_processes_cannot_hold_one_run(script, finished, tmp_path):
     second = run_script(script, "--resume", str(finished), "--total-timesteps", "512", cwd=tmp_path)
     os.close(held.lock)
     assert second.returncode == 2
-    assert second.stderr == f"--resume {finished}: another process is training there; wait for its end\n"
+    assert second.stderr == f"--resume {finished}: another process holds it; wait for its end\n"
     third = run_script(script, "--resume", str(finished), "--total-timesteps", "512", cwd=tmp_path)
     assert third.returncode == 0
 
@@ -316,7 +325,6 @@ def has_a_point(directory: Path) -> bool:
     return (directory / "runs").exists() and EVERY_ITERATION in scalars(run_dir_in(directory))
 
 
-@pytest.mark.slow
 def test_a_second_signal_ends_at_once(script, tmp_path):
     """An iteration that takes minutes is not waited for."""
     flags = flags_of(env_id="CartPole-v1", num_envs=4, num_steps=250_000, total_timesteps=1_000_000, threads=1)
@@ -325,20 +333,22 @@ def test_a_second_signal_ends_at_once(script, tmp_path):
     )
     wait_until(lambda: list(tmp_path.glob("runs/*/checkpoint.pt")), process)
     process.send_signal(signal.SIGTERM)
-    assert "once more" in process.stderr.readline() + process.stderr.readline()
+    assert "once more" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert process.wait(timeout=10) == -signal.SIGTERM
 
 
 @pytest.mark.parametrize("where", ["value_loss", "surrogate"])
-def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, where, tmp_path, monkeypatch):
+def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, where, tmp_path, monkeypatch, capfd):
     function, calls = getattr(script, where), []
     poisoned = lambda *given: function(*given) * (float("nan") if calls.append(1) or len(calls) > 16 else 1)  # noqa: E731
     monkeypatch.setattr(script, where, poisoned)
     args = script.Args(env_id="CartPole-v1", total_timesteps=1280, checkpoint_minutes=0, **SMALL)
     with pytest.raises(SystemExit) as stopped:
         script.train(args, make_envs("CartPole-v1", 4), script.RunDirectory(str(tmp_path)))
-    assert re.search(r"not finite in iteration 2, step 256: .*(policy_loss|value_loss).*actor", stopped.value.code)
+    assert stopped.value.code == 1
+    said = capfd.readouterr().err
+    assert re.search(r"not finite in iteration 2, step 256: .*(policy_loss|value_loss).*actor", said)
     state = checkpoint_of(tmp_path)
     assert state["global_step"] == 128
     assert all(value.isfinite().all() for value in state["agent"].values())
@@ -363,7 +373,7 @@ def test_a_full_disk_is_said_once_and_training_goes_on(script, bytes_allowed, to
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_allowed, bytes_allowed)),
     )
     assert run.returncode == 1
-    assert run.stderr.count("\n") == 1 and "training goes on" in run.stderr
+    assert run.stderr.count("\n") == 1 and "the run goes on" in run.stderr
     run_dir = run_dir_in(tmp_path)
     assert not (run_dir / "checkpoint.pt.new").exists()
     if last_saved is None:

@@ -46,6 +46,20 @@ class RenderedPixels(TinyPixels):
         return self.screen()
 
 
+class Endless(gym.Env):
+    """Nothing happens, for ever."""
+
+    observation_space = Box(0, 1, (2,), np.float32)
+    action_space = Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(2, np.float32), 0.0, False, False, {}
+
+
+gym.register("Endless-v0", Endless)
 gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
 gym.register("TinyPixels-v0", TinyPixels, max_episode_steps=20)
 gym.register("TinyPixelsGrey-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": None})

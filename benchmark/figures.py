@@ -169,8 +169,9 @@ def read_run(directory: Path) -> tuple[dict, pd.DataFrame]:
         **key,
         "steps": int(curve.index[-1]),
         "total_timesteps": args["total_timesteps"],
-        "command": record["command"],
-        "arguments": json.dumps(args),
+        # Without the directory that it was logged to: a path of one machine, which tells nothing of the run
+        "command": re.sub(r" --log-dir ('[^']*'|\S+)", "", record["command"]),
+        "arguments": json.dumps({name: value for name, value in args.items() if name != "log_dir"}),
         "versions": json.dumps(versions),
         **{name: provenance[name] for name in PLACE},
     }

@@ -58,7 +58,7 @@ def run_script(script, *flags: str, cwd: Path) -> subprocess.CompletedProcess:
 
 
 @pytest.fixture
-def call_main(monkeypatch, capsys):
+def call_main(monkeypatch, capfd):
     """Calls a script's `main` in this process, for what ends before it trains: (exit status, stdout, stderr)."""
 
     def call(script, *flags: str) -> tuple[int, str, str]:
@@ -72,6 +72,6 @@ def call_main(monkeypatch, capsys):
             status = ended.code
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        return status, *capsys.readouterr()
+        return status, *capfd.readouterr()
 
     return call

@@ -9,13 +9,16 @@ those of the thesis: minibatches of 256 screens for the update, 8 screens for a 
 import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from statistics import median, quantiles
 
 if __name__ == "__main__":
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the scripts do, before torch is imported
 
+import numpy as np
 import torch
 import tyro
+from ale_py.vector_env import AtariVectorEnv
 from torch import nn
 from torch.distributions import Categorical
 
@@ -53,6 +56,26 @@ def forward(network: nn.Module, screens: torch.Tensor, mode: Callable) -> Callab
     return run
 
 
+def rollout_step(groups: int) -> Callable:
+    """Returns one agent step in 8 games. With two groups, the games of one run while the network serves the other."""
+    network = nature_cnn().to(memory_format=torch.channels_last)
+    size = NUM_ENVS // groups
+    games = [AtariVectorEnv("breakout", size, num_threads=2 // groups, use_fire_reset=False) for _ in range(groups)]
+    for envs in games:
+        envs.reset(seed=1)
+    actions, pool = np.ones(size, dtype=np.int64), ThreadPoolExecutor(1)
+    pending = [pool.submit(envs.step, actions) for envs in games]
+
+    def run():
+        for i, envs in enumerate(games):
+            screens = torch.from_numpy(pending[i].result()[0]).contiguous(memory_format=torch.channels_last)
+            with torch.inference_mode():
+                network(screens.float().div_(255.0))
+            pending[i] = pool.submit(envs.step, actions)
+
+    return run
+
+
 def tricks() -> dict[str, tuple[Callable, Callable]]:
     """Returns the pairs to compare: what it is, the plain form, the trick."""
     nhwc = torch.randint(0, 256, (4 * MINIBATCH, 84, 84, 4), dtype=torch.uint8)
@@ -78,6 +101,7 @@ def tricks() -> dict[str, tuple[Callable, Callable]]:
             lambda: Categorical(logits=logits).sample(),
             lambda: torch.multinomial(logits.log_softmax(-1).exp(), 1).squeeze(-1),
         ),
+        "rollout: half the games run while the network serves the others (refused)": (rollout_step(1), rollout_step(2)),
     }
 
 

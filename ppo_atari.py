@@ -593,11 +593,13 @@ def main() -> None:
         with run.loading("evaluate"):
             agent.load_state_dict(state["agent"])
     stop.listen(signal.SIG_DFL)  # there is nothing left to save
-    state = state if run.failed else run.load(Args)
-    if stop.number and not run.failed and state["iteration"] < args.last_iteration:
+    if run.failed:
+        sys.exit(1)
+    state = run.load(Args)
+    if stop.number and state["iteration"] < args.last_iteration:
         say(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path])}")
         sys.exit(128 + stop.number)
-    finished = args.last_iteration == args.num_iterations and not stop.number and not run.failed
+    finished = args.last_iteration == args.num_iterations and not stop.number
     if args.evaluate is not None or (finished and args.eval_episodes > 0):
         evaluate(args, agent, run, state)
     sys.exit(1 if run.failed else 0)

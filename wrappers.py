@@ -11,7 +11,7 @@ game (`SAME_STEP`): with Gymnasium's default, `NEXT_STEP`, every game would be f
 PPO then trains on.
 
 Run directory: `RunDirectory` holds a run's checkpoint, event files and `args.json`; `StopSignal` asks for a clean end.
-Nothing in this file knows the algorithm, and nothing of the algorithm stands outside the scripts.
+Of the algorithm, this file knows the names of the curves in `LAYOUT` and nothing else.
 """
 
 import contextlib
@@ -113,10 +113,11 @@ def make_envs(
     return TransformReward(envs, np.sign)
 
 
-def env_seeds(seed: int, num_envs: int, starts: int = 0) -> list[int]:
+def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int]:
     """Returns a seed for each environment, drawn from one `SeedSequence`: runs with neighbouring seeds share none.
 
-    A run that has been started `starts` times before gets the next numbers of its sequence, for new games.
+    A run that has been started `starts` times before gets the next numbers of its sequence, for new games; what is
+    played beside the training has a sequence of its own, `[seed, 1]` and so on.
     Gymnasium's own rule, seed, seed + 1, …, gives run 2 seven of the eight environments of run 1. 31 bits, because
     ale-py refuses larger ones.
     """

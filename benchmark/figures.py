@@ -38,8 +38,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
-import ale_py
-import gymnasium as gym
 import matplotlib
 import numpy as np
 import pandas as pd
@@ -50,6 +48,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from wrappers import FRAME_SKIP, find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
 DEFAULT_OUT = ROOT / "benchmark" / "results"
@@ -495,9 +495,7 @@ def split_readme(readme: Path) -> list[str] | None:
 # ----------------------------------------------------------------------------------------------------- figures
 def frames_per_step(game: str) -> int:
     """Returns the emulator frames of an agent step: 4 on Atari, 1 elsewhere, where a step is all there is."""
-    gym.register_envs(ale_py)
-    name = re.sub(r"^ale/|_|noframeskip-v4$|-v5$", "", game.lower())
-    return 4 if name in {spec.name.lower() for spec in gym.registry.values() if spec.namespace == "ALE"} else 1
+    return FRAME_SKIP if find_atari_game(game) else 1
 
 
 def style(curves: Curves, variant: str) -> dict[str, str]:

@@ -126,10 +126,13 @@ def test_a_video_of_atari_shows_the_game_that_the_agent_plays(script, tmp_path):
     assert sum(raw_rewards) == score and len(raw_rewards) == length
     assert len(screens) == length + 1 == len(observations)
     assert screens[0].shape == (210, 160, 3)
-    for screen, observation in list(zip(screens, observations))[:: max(1, length // 20)]:
-        grey = cv2.resize(cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY), (84, 84), interpolation=cv2.INTER_AREA)
-        assert np.abs(grey.astype(int) - observation).mean() < 4  # of 255: VP9 loses some, another game far more
-    assert np.std([screen.mean() for screen in screens]) > 0.1  # it moves
+    small = [cv2.cvtColor(screen, cv2.COLOR_RGB2GRAY) for screen in screens]
+    small = [cv2.resize(screen, (84, 84), interpolation=cv2.INTER_AREA).astype(int) for screen in small]
+    in_step, late = (
+        [np.abs(screen - observation).mean() for screen, observation in zip(shown, observations)]
+        for shown in (small, small[5:])
+    )
+    assert max(in_step) < np.mean(late)  # VP9 loses a little, five agent steps are more
 
 
 def test_what_cannot_be_rendered_is_refused_before_a_run_begins(script, tmp_path, monkeypatch, call_main):

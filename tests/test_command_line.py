@@ -12,6 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import acppo_atari
 from conftest import ROOT, SHORT_CARTPOLE, TINY_PIXELS, run_script, scalars
+from wrappers import LAYOUT
 
 
 def documented_tags() -> set[str]:
@@ -19,7 +20,7 @@ def documented_tags() -> set[str]:
     return set(re.findall(r"^\| `((?:charts|losses|time|eval)/\w+)`", (ROOT / "README.md").read_text(), re.MULTILINE))
 
 
-@pytest.mark.parametrize("env_id", [SHORT_CARTPOLE, TINY_PIXELS, "Breakout"])
+@pytest.mark.parametrize("env_id", [SHORT_CARTPOLE, pytest.param(TINY_PIXELS, marks=pytest.mark.slow), "Breakout"])
 def test_a_run_logs_every_documented_tag_with_finite_values(script, env_id, tmp_path):
     num_steps = "128" if env_id == "Breakout" else "64"  # long enough for a game of Breakout to end
     run = run_script(
@@ -42,6 +43,8 @@ def test_a_run_logs_every_documented_tag_with_finite_values(script, env_id, tmp_
     assert re.fullmatch(rf"{re.escape(env_id.replace(':', '-'))}__{exp_name}__1__\d+", run_dir.name)
     logged = scalars(run_dir)
     assert logged.keys() == documented_tags()
+    charts = [tags for page in LAYOUT.values() for _, tags in page.values()]
+    assert len(charts) == 4 and all(set(tags) <= logged.keys() for tags in charts)
     assert all(math.isfinite(value) for points in logged.values() for _, value in points)
     num_iterations = 1024 // (4 * int(num_steps))
     assert len(logged["losses/kl"]) == num_iterations

@@ -19,6 +19,7 @@ def test_beyond_the_tried_bounds_there_is_no_match(wanted):
     assert math.isnan(match_delta.interpolate([0.01, 1.0], [0.3, 0.0], wanted))
 
 
+@pytest.mark.slow
 def test_a_tight_bound_clips_more_than_a_wide_one(capsys):
     """Two iterations on CartPole, whole processes."""
     match_delta.main(games=("CartPole-v1",), deltas=(1e-4, 10.0), iterations=2, jobs=2)

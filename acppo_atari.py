@@ -32,10 +32,11 @@ if __name__ == "__main__":  # here alone: importing this file leaves the importe
     # Idle OpenMP threads would spin on the cores that the games' threads need. torch reads this when it is imported.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # glibc gives tensors of megabytes back to the system and faults their pages in again, 16 times an iteration:
-    # keeping them takes the update from 2.1 to 1.7 s. -1 and -3 are M_TRIM_THRESHOLD and M_MMAP_THRESHOLD, in bytes.
+    # keeping them takes these 16 steps from 2.1 to 1.7 s. -1: M_TRIM_THRESHOLD, -3: M_MMAP_THRESHOLD, in bytes.
     if hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-1, 1 << 30)
-        libc.mallopt(-3, 1 << 30)
+        if not libc.mallopt(-3, 1 << 30):
+            libc.mallopt(-3, 1 << 25)  # the most that an older glibc takes
 
 import numpy as np
 import torch
@@ -80,7 +81,7 @@ class Args:
     """weight of the advantage in the clip range ε / (1 + c·|Â|) (section 3.1): 0 is PPO, `inf` the range δ / |Â|, which
     is the thesis's product-only objective"""
     clip_vloss: bool = True
-    """clip the value loss as CleanRL does; `--no-clip-vloss` is the plain squared error of appendix B"""
+    """clip the value loss as CleanRL does; `--no-clip-vloss` is half the plain squared error of appendix B"""
     vf_clip_coef: float = 0.1
     """how far a value may move in one update before its loss stops pulling, in units of return (CleanRL uses
     its clip range; here it is a coefficient of its own, so that ε never touches the value loss)"""
@@ -99,7 +100,7 @@ class Args:
     """have cuDNN choose deterministic algorithms (CleanRL); on a CPU, seed and thread count determine the run"""
     cuda: bool = True
     """use a GPU if there is one"""
-    threads: int = field(default_factory=lambda: available_cores())
+    threads: int = field(default_factory=available_cores)
     """threads for torch and for the games, which take turns; the default is the cores this process may use"""
     bf16: bool = False
     """run the network's trunk in bfloat16 (ours): faster on processors with AVX512-BF16 or AMX, far slower on others;
@@ -122,7 +123,8 @@ class Args:
     resume: str | None = None
     """directory of a run to go on with, under its own arguments; a flag given beside this one replaces the run's"""
     stop_at: int | None = None
-    """agent steps at which this call ends, with a checkpoint; the schedule stays that of the whole run"""
+    """agent steps at which this call ends, with a checkpoint, rounded up to whole rollouts; the schedule stays that of
+    the whole run"""
 
     @property
     def batch_size(self) -> int:
@@ -149,11 +151,12 @@ class Args:
         most_threads, compiler = 4 * available_cores(), os.environ.get("CXX", "g++")
         rollout = f"num_envs · num_steps = {self.batch_size}"
         sizes = "total_timesteps num_envs num_steps num_minibatches update_epochs"
-        rules = [  # 1e30: float32 must hold what is computed with it
-            (sizes, lambda x: x > 0, "give a whole number above 0"),
-            ("clip_coef vf_clip_coef", lambda x: 0 < x < 1e30, "give a finite number above 0"),
-            ("learning_rate max_grad_norm", lambda x: 0 < x < 1e30, "give a finite number above 0"),
-            ("ent_coef vf_coef checkpoint_minutes", lambda x: 0 <= x < 1e30, "give a finite number, 0 or above"),
+        positive = "clip_coef vf_clip_coef learning_rate max_grad_norm"
+        rules = [
+            (sizes, lambda x: 0 < x <= 10**12, "give a whole number from 1 to 10^12"),
+            # 1e30: float32 must hold what is computed with it
+            (positive, lambda x: 0 < x < 1e30, "give a number above 0 and below 1e30"),
+            ("ent_coef vf_coef checkpoint_minutes", lambda x: 0 <= x < 1e30, "give a number from 0 to below 1e30"),
             ("eval_episodes", lambda x: 0 <= x <= 1_000_000, "give a whole number from 0 to 1,000,000"),
             ("c", lambda x: 0 <= x < 1e30 or x == math.inf, "give a number, 0 or above, or inf"),
             ("gamma gae_lambda", lambda x: 0 <= x <= 1, "give a number from 0 to 1"),
@@ -203,7 +206,7 @@ class Agent(nn.Module):
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Maps observations, uint8 (B, 84, 84, 4) or float32 (B, D), to logits (B, A) and values (B,)."""
-        # The view makes (B, 4, 84, 84) in channels-last layout, where an update takes 114 ms, 153 in torch's default.
+        # The view makes (B, 4, 84, 84) in channels-last layout, where a gradient step takes 114 ms, 153 in torch's.
         x = obs.movedim(-1, 1)
         if obs.dtype == torch.uint8:
             x = x.float().div_(255.0)  # 2.2 ms for a minibatch, x / 255 takes 3.2
@@ -257,11 +260,11 @@ def compute_gae(rewards, values, next_values, terminations, truncations, gamma: 
     follows; a truncation only that nothing more was seen.
     """
     deltas = rewards + gamma * next_values * ~terminations - values  # δ_t
-    carry = gamma * gae_lambda * ~(terminations | truncations)  # no advantage flows back out of the next episode
+    not_done = ~(terminations | truncations)  # no advantage flows back out of the next episode
     advantages = torch.zeros_like(rewards)
-    following = torch.zeros_like(rewards[0])
+    last_advantage = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
-        advantages[t] = following = deltas[t] + carry[t] * following
+        advantages[t] = last_advantage = deltas[t] + gamma * gae_lambda * not_done[t] * last_advantage
     return advantages
 
 
@@ -297,9 +300,9 @@ def value_loss(new_values, values, returns, vf_clip_coef: float | None) -> Tenso
 def policy_change(logprobs, new_logprobs, actions, advantages) -> dict[str, Tensor]:
     """Measures how far an update moved the policy on the B states of its rollout (the README defines each name).
 
-    Args: log-probabilities of all actions before and after (B, A), the actions taken (B,), the advantages as the
-    objective saw them (B,). `kl` and the distances are exact over actions; the other three use the action taken, as
-    the thesis's chapter 4 does.
+    Args: log-probabilities of all actions before and after (B, A), the actions taken (B,), the advantages (B,),
+    normalised over the rollout. `kl` and the distances are exact over actions; the other three use the action taken,
+    as the thesis's chapter 4 does.
     """
     logratio = (new_logprobs - logprobs).gather(1, actions[:, None]).squeeze(1)
     ratio = logratio.exp()
@@ -332,6 +335,7 @@ def play(agent: Agent, envs: VectorEnv, num_games: int, seed: list[int]) -> list
     generator = torch.Generator(device).manual_seed(seed[0])
     obs, _ = envs.reset(seed=env_seeds(seed, envs.num_envs))
     games = [[] for _ in range(envs.num_envs)]
+    # Environment n plays the games n, n + N, n + 2N, … of all
     shares = [len(range(n, num_games, envs.num_envs)) for n in range(envs.num_envs)]
     steps_left = 27_000 * max(shares)  # Atari's longest games; other environments may have no time limit
     while steps_left > 0 and any(len(played) < share for played, share in zip(games, shares, strict=True)):
@@ -365,9 +369,10 @@ def record_game(args: Args, agent: Agent, run: RunDirectory, global_step: int) -
     with run.reporting():
         os.makedirs(os.path.dirname(path), exist_ok=True)
         envs = make_envs(args.env_id, 1, args.threads, video=path + ".webm")
-        score = sum(score for score, _ in play(agent, envs, 1, seed=[args.seed, 2]))
+        scores = [score for score, _ in play(agent, envs, 1, seed=[args.seed, 2])]
         envs.close()
-        os.replace(path + ".webm", f"{path}_score_{score:.10g}.webm")
+        result = f"score_{scores[0]:.10g}" if scores else "without_end"
+        os.replace(path + ".webm", f"{path}_{result}.webm")
 
 
 # ----------------------------------------------------------------------------------------------------- training
@@ -388,8 +393,8 @@ def train(
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
 
     # Where the run stands: at its beginning, or at its checkpoint with new games, for the emulators are not kept
-    iteration, global_step, seconds_before = 0, 0, 0.0  # global_step: agent steps, over all environments
-    starts = 0  # so far; each start draws environment seeds of its own
+    # global_step: agent steps, over all environments; starts: so far, each draws environment seeds of its own
+    iteration, global_step, starts = 0, 0, 0
     last_scores = deque(maxlen=100)  # raw returns of whole games
     if state is not None:
         with run.loading():
@@ -397,8 +402,7 @@ def train(
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
             for parameter, moments in optimizer.state.items():
                 assert parameter.shape == moments["exp_avg"].shape == moments["exp_avg_sq"].shape
-            iteration, global_step, seconds_before = state["iteration"], state["global_step"], state["seconds"]
-            starts = state["starts"]
+            iteration, global_step, starts = state["iteration"], state["global_step"], state["starts"]
             last_scores.extend(state["last_scores"])
             torch.set_rng_state(state["rng"][0])
             if device.type == "cuda" and len(state["rng"]) > 1:
@@ -424,9 +428,8 @@ def train(
     # Executables: what runs the network in the loop, compiled or not, under one name
     policy = torch.compile(agent, dynamic=False) if args.compile else agent
 
-    started = time.perf_counter()
-    checkpoint_due = started  # at once, so that there is something to resume from at every moment
-    iteration_ends = deque([started], maxlen=11)  # SPS is measured over the last 10 iterations
+    checkpoint_due = time.perf_counter()  # at once, so that there is something to resume from at every moment
+    iteration_ends = deque([checkpoint_due], maxlen=11)  # SPS is measured over the last 10 iterations
     status_line = StatusLine()
 
     while True:
@@ -434,12 +437,10 @@ def train(
         # Checkpoint: when due, and at the end
         finished = iteration >= args.last_iteration or stop.number != 0
         if finished or time.perf_counter() >= checkpoint_due:
-            seconds = seconds_before + time.perf_counter() - started
-            where = {"iteration": iteration, "global_step": global_step, "seconds": seconds, "starts": starts + 1}
-            learnt = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"]}
+            progress = {"iteration": iteration, "global_step": global_step, "starts": starts + 1}
+            learner = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"]}
             rng = [torch.get_rng_state(), *([torch.cuda.get_rng_state()] if device.type == "cuda" else [])]
-            scores = {"last_scores": list(last_scores)}
-            run.save({"args": vars(args), **where, **learnt, **scores, "rng": rng})
+            run.save({"args": vars(args), **progress, **learner, "last_scores": list(last_scores), "rng": rng})
             checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
         if args.capture_video and not stop.number and iteration in [args.num_iterations * k // 4 for k in range(5)]:
             record_game(args, agent, run, global_step)
@@ -453,7 +454,7 @@ def train(
 
         # Rollout: T steps in N environments with the current policy
         obs[0] = obs[T]
-        games = []  # (agent step, score, agent steps) of each game that ends
+        games = []  # (global_step, score, length in agent steps) of each game that ends
         for t in range(T):
             # Copied into the storage, because tensors made under inference_mode cannot enter a loss
             actions[t], logprobs[t], values[t] = act(policy, obs[t])
@@ -469,9 +470,8 @@ def train(
                 final_obs = np.stack(infos["final_obs"][truncated])  # the other rows are uninitialised memory
                 # By the agent as it is: compiled, it would be compiled anew for each number of them
                 final_values[t, truncations[t]] = value_of(agent, from_envs(final_obs, device))
-            if "episode" in infos:
-                for n in np.flatnonzero(infos["_episode"]):
-                    games.append((global_step, infos["episode"]["r"][n], infos["episode"]["l"][n]))
+            for n in np.flatnonzero(infos.get("_episode", False)):
+                games.append((global_step, float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
             stopwatch.lap("storage")
 
         # Advantages, and the TD(λ) returns that the values are fitted to
@@ -488,6 +488,7 @@ def train(
         stopwatch.lap("advantages")
 
         # Update: several epochs of minibatch gradient steps on the rollout
+        vf_clip_coef = args.vf_clip_coef if args.clip_vloss else None
         minibatch_stats = []  # of tensors, read once an iteration: .item() in here would wait for the device
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(args.batch_size, device=device).split(args.minibatch_size):
@@ -502,7 +503,6 @@ def train(
 
                 clip = clip_range(mb_advantages, args.clip_coef, args.c)
                 pg_loss = -surrogate(ratio, mb_advantages, clip).mean()
-                vf_clip_coef = args.vf_clip_coef if args.clip_vloss else None
                 v_loss = value_loss(new_values, b_values[mb_inds], b_returns[mb_inds], vf_clip_coef)
                 entropy = -(new_logprobs.exp() * new_logprobs).sum(-1).mean()
                 loss = pg_loss + args.vf_coef * v_loss - args.ent_coef * entropy
@@ -516,10 +516,11 @@ def train(
                     approx_kl = ((ratio - 1) - logratio).mean()
                     clipfrac = ((ratio - 1).abs() > clip).float().mean()  # each sample against its own range
                     avg_clip_ratio = clip.clamp(max=1).mean()  # a range above 1 cannot bind below; δ / 0 is infinite
-                stats = (pg_loss, v_loss, entropy, clipfrac, avg_clip_ratio, approx_kl)
-                minibatch_stats.append(torch.stack(stats).detach())
+                stats = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "clipfrac": clipfrac}
+                stats |= {"avg_clip_ratio": avg_clip_ratio, "minibatch_approx_kl": approx_kl}
+                minibatch_stats.append(torch.stack(list(stats.values())).detach())
             if args.target_kl is not None:
-                epoch_kl = torch.stack(minibatch_stats[-args.num_minibatches :])[:, -1].mean()
+                epoch_kl = torch.stack(minibatch_stats[-args.num_minibatches :])[:, -1].mean()  # of approx_kl, the last
                 if epoch_kl > args.target_kl:
                     break
         stopwatch.lap("update")
@@ -527,8 +528,8 @@ def train(
         # How far the policy moved, over the whole rollout (in minibatches, to bound the memory)
         with torch.inference_mode():
             new_logprobs = torch.cat([policy(chunk)[0].log_softmax(-1) for chunk in b_obs.split(args.minibatch_size)])
-            seen_advantages = normalize(b_advantages) if args.norm_adv else b_advantages
-            change = policy_change(b_logprobs, new_logprobs, b_actions, seen_advantages)
+            rollout_advantages = normalize(b_advantages) if args.norm_adv else b_advantages
+            change = policy_change(b_logprobs, new_logprobs, b_actions, rollout_advantages)
             variance = b_returns.var()  # 0 where all returns are equal, which leaves nothing to explain
             explained_variance = torch.where(variance > 0, 1 - (b_returns - b_values).var() / variance, math.nan)
         stopwatch.lap("kl_pass")
@@ -536,12 +537,11 @@ def train(
         # Log: once an iteration, the games at the steps where they ended
         points = []
         for step, score, length in games:
-            last_scores.append(float(score))
+            last_scores.append(score)
             points += [("charts/episodic_return", score, step), ("charts/episodic_length", length, step)]
         if last_scores:
             points.append(("charts/mean_return_100", np.mean(last_scores), global_step))
-        names = ("policy_loss", "value_loss", "entropy", "clipfrac", "avg_clip_ratio", "ratio")  # as in `stats`
-        losses = dict(zip(names, torch.stack(minibatch_stats).mean(0).tolist(), strict=True))
+        losses = dict(zip(stats, torch.stack(minibatch_stats).mean(0).tolist(), strict=True))
         losses |= {name: value.item() for name, value in change.items()}
         broken = [name for name, value in losses.items() if not math.isfinite(value)]
         broken += [name for name, parameter in agent.named_parameters() if not parameter.isfinite().all()]
@@ -549,7 +549,7 @@ def train(
             say(f"{run.path}: not finite in iteration {iteration}, step {global_step}: {', '.join(broken)}")
             sys.exit(1)
         losses["explained_variance"] = explained_variance.item()  # may be NaN
-        del losses["ratio"]  # its approx_kl, whose mean over minibatches is no curve of its own
+        del losses["minibatch_approx_kl"]  # no curve of its own: `approx_kl` is that of the whole update
         points += [(f"losses/{name}", value, global_step) for name, value in losses.items()]
         iteration_ends.append(time.perf_counter())
         sps = (len(iteration_ends) - 1) * args.batch_size / (iteration_ends[-1] - iteration_ends[0])
@@ -571,8 +571,10 @@ def train(
 def main() -> None:
     # TensorBoard's thread prints a traceback when the disk is full; RunDirectory says it in one line
     threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
-    args, state, stop = tyro.cli(Args), None, StopSignal()
+    args = tyro.cli(Args, description=__doc__)
+    stop = StopSignal()
     stop.listen()
+    state = None
     flag = "evaluate" if args.resume is None else "resume"
     directory = getattr(args, flag)
     if directory is not None:
@@ -606,9 +608,10 @@ def main() -> None:
     stop.listen(signal.SIG_DFL)  # there is nothing left to save
     if run.failed:
         sys.exit(1)
-    state = run.load(Args)
+    state = run.load(Args)  # as the last save left it
     if stop.number and state["iteration"] < args.last_iteration:
-        say(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path])}")
+        stop_at = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
+        say(f"Stopped; go on with: {shlex.join([sys.executable, __file__, '--resume', run.path, *stop_at])}")
         sys.exit(128 + stop.number)
     finished = args.last_iteration == args.num_iterations and not stop.number
     if args.evaluate is not None or (finished and args.eval_episodes > 0):

@@ -11,7 +11,7 @@ game (`SAME_STEP`): with Gymnasium's default, `NEXT_STEP`, every game would be f
 PPO then trains on.
 
 Run directory: `RunDirectory` holds a run's checkpoint, event files and `args.json`; `StopSignal` asks for a clean end.
-Of the algorithm, this file knows the names of the curves in `LAYOUT` and nothing else.
+Of the algorithm, this file knows the curves in `LAYOUT` and the fields of a checkpoint (`load`).
 """
 
 import contextlib
@@ -79,9 +79,9 @@ def make_envs(
     Returns:
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
         float32 (N, D) for flat ones. Rewards: sign-clipped for Atari, as they are elsewhere.
-        Where a game has ended, `info["_episode"]` (N,) is true and `info["episode"]` holds its raw, unclipped score
-        `"r"` and its length `"l"` in agent steps; where it was truncated, `info["final_obs"]` holds the observation
-        that it ended on (rows of other environments are not to be read).
+        After a step in which games have ended, and no other, `info["_episode"]` (N,) is true for those and
+        `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; where one was
+        truncated, `info["final_obs"]` holds the observation that it ended on (other rows are not to be read).
 
     Raises:
         ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
@@ -117,7 +117,7 @@ def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int
     """Returns a seed for each environment, drawn from one `SeedSequence`: runs with neighbouring seeds share none.
 
     A run that has been started `starts` times before gets the next numbers of its sequence, for new games; what is
-    played beside the training has a sequence of its own, `[seed, 1]` and so on.
+    played beside the training has sequences of its own, `[seed, 1]` for evaluations and `[seed, 2]` for videos.
     Gymnasium's own rule, seed, seed + 1, …, gives run 2 seven of the eight environments of run 1. 31 bits, because
     ale-py refuses larger ones.
     """
@@ -250,7 +250,8 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
 
     name, variant = re.fullmatch(r"(.*?)((?:NoFrameskip|Deterministic|-ram)*(?:-v\d+)?)", env_id, re.DOTALL).groups()
     key = name.removeprefix("ALE/").replace("_", "").lower()
-    if key in {rom.replace("_", "") for rom in ale_py.roms.get_all_rom_ids()} - atari_specs().keys():
+    two_player = {rom.replace("_", "") for rom in ale_py.roms.get_all_rom_ids()} - atari_specs().keys()
+    if key in two_player:
         raise ValueError("the game has no mode for one player; choose another")
     if key not in atari_specs():
         return None
@@ -392,7 +393,12 @@ class RunDirectory:
 
     def describe(self, args, step: int) -> None:
         """Writes what the run is to `args.json`, and as text to TensorBoard, with the layout of its custom scalars."""
-        about = {"command": command_line(args), "args": saved_args(vars(args)), "provenance": provenance()}
+        about = {
+            "command": command_line(args),
+            "started_at_step": step,  # above 0 for a resumed run, which the command does not repeat
+            "args": saved_args(vars(args)),
+            "provenance": provenance(),
+        }
         path = os.path.join(self.path, "args.json")
         with self.reporting():
             with open(path + ".new", "w") as file:
@@ -401,7 +407,7 @@ class RunDirectory:
         with self.logging():
             self.writer = SummaryWriter(self.path)
             self.writer.add_custom_scalars(LAYOUT)
-            provenance_rows = {"command": about["command"], **about["provenance"]}
+            provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
             for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
                 table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
                 self.writer.add_text(tag, "\n".join(table), step)
@@ -476,7 +482,7 @@ class RunDirectory:
             state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
             args, hints = state["args"], typing.get_type_hints(args_class)
             whole &= {type(state[name]) for name in ("iteration", "global_step", "starts")} == {int}
-            whole &= {float} == {type(number) for number in (state["seconds"], *state["last_scores"])}
+            whole &= all(type(score) is float for score in state["last_scores"])
             whole &= state["global_step"] == state["iteration"] * args["num_envs"] * args["num_steps"]
             whole &= state["iteration"] >= 0 and 0 <= state["starts"] < 10**6
             whole &= all(tensor.isfinite().all().item() for tensor in state["agent"].values())
@@ -531,7 +537,7 @@ class StatusLine:
         self.due = time.perf_counter() + 60
 
     def show(self, line: str, last: bool) -> None:
-        if sys.stderr.isatty():
+        if os.isatty(2):
             say(line, end="\n" if last else "")
         elif time.perf_counter() >= self.due:
             say(line)
@@ -540,9 +546,10 @@ class StatusLine:
 
 def say(text: str, end: str = "\n") -> None:
     """Writes to standard error, whatever has become of it: the end of a pipe or a full disk must not end the run."""
-    start = "\r\x1b[K" if sys.stderr.isatty() else ""  # over the status line
+    start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
     with contextlib.suppress(OSError):
-        os.write(2, (start + text + end).encode())
+        if sys.stderr is not None:  # None: closed before Python started, and 2 may be a file of ours
+            os.write(2, (start + text + end).encode())
 
 
 def saved_args(args: dict[str, object]) -> dict[str, object]:
@@ -596,5 +603,6 @@ def available_cores() -> int:
 
 def refuse(name: str, given: object, advice: object) -> typing.NoReturn:
     """Ends the program with status 2 and one line: the flag, what was given to it, and what to do."""
-    print(" ".join(f"--{name.replace('_', '-')} {given}: {advice}".split()), file=sys.stderr)
+    line = f"--{name.replace('_', '-')} {given}: {advice}"
+    print(" ".join(line.split()), file=sys.stderr)  # one line, whatever an error's text has
     sys.exit(2)

@@ -206,8 +206,17 @@ def test_games_that_do_not_end_are_left_out(script, monkeypatch):
     envs = make_envs("tiny_envs:Endless-v0", 2)
     steps = []
     monkeypatch.setattr(script, "act", lambda agent, obs, generator: (steps.append(1) or torch.zeros(2).long(), 0, 0))
-    assert script.play(agent_for(script, "tiny_envs:Endless-v0"), envs, 2, seed=[1, 1]) == []
+    agent = agent_for(script, "tiny_envs:Endless-v0")
+    assert script.play(agent, envs, 2, seed=[1, 1]) == []
     assert len(steps) == 27_000
+
+
+def test_the_video_of_a_game_that_does_not_end_has_no_score(script, tmp_path, monkeypatch):
+    args = script.Args(env_id="tiny_envs:RenderedPixels-v0", log_dir=str(tmp_path), threads=1)
+    run = script.RunDirectory.make(args)
+    monkeypatch.setattr(script, "play", lambda agent, envs, num_games, seed: envs.reset() and [])
+    script.record_game(args, agent_for(script, args.env_id), run, global_step=7)
+    assert [path.name for path in tmp_path.glob("*/videos/*")] == ["step_7_without_end.webm"] and not run.failed
 
 
 @pytest.mark.slow
@@ -250,6 +259,7 @@ def test_the_run_directory_says_how_to_repeat_the_run(script, tmp_path):
     run_script(script, *flags, cwd=tmp_path)
     (run_dir,) = (tmp_path / "runs").iterdir()
     about = json.loads((run_dir / "args.json").read_text())
+    assert about["started_at_step"] == 0
     assert about["args"]["gamma"] == 0.9 and about["args"]["norm_adv"] is False
     assert about["provenance"]["torch"].startswith("2.13.0") and len(about["provenance"]["commit"]) >= 16
     python, name, *words = shlex.split(about["command"])
@@ -273,8 +283,11 @@ def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, tmp_pat
     for clock[0] in range(0, 200, 10):
         line.show(f"at {clock[0]}", last=False)
     assert capfd.readouterr().err == "at 60\nat 120\nat 180\n"
-    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(wrappers.os, "isatty", lambda descriptor: True)
     line.show("a", last=False)
     line.show("b", last=True)
     clear = "\r\x1b[K"
     assert capfd.readouterr().err == f"{clear}a{clear}b\n"
+    monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it where the shell closed it: 2>&-
+    line.show("c", last=True)
+    assert capfd.readouterr().err == ""

@@ -8,23 +8,29 @@ an iteration; runs that are in them already and have no directory here keep thei
 machines add up. `draw` makes the rest from those two files alone: OUT/figures/*.png and *.svg, OUT/tables.md, and the
 results in the README. A thesis-sized run takes three seconds to read, the drawing of all thirty half a minute.
 
-How the thesis's claims are judged, written down before the runs. A pair is a run of `ppo` and one of `acppo` with the
-same game and seed, both cut at the last step that both have reached. Each pair has a margin for each claim, above 0
-where it has the claim's sign:
-    score       final `mean_return_100`, acppo - ppo (across games in units of human minus random score)
-    KL          log of the ratio of the means of `losses/kl`, ppo / acppo
-    spikes      share of iterations with a KL above the 99th percentile of ppo's in the same game (all its seeds, up to
-                the same step), ppo - acppo
-    jumps       share of iterations with a KL above ten times the run's own median, ppo - acppo
-    clip ratio  0.02 - |mean of `losses/avg_clip_ratio` - 0.1|, so above 0 from 0.08 to 0.12; of each acppo run alone
+What is compared: of each game, the runs that are at least half as long as its longest, all cut at the last step that
+all of them have reached. The figures show every run as far as it got.
+
+How the thesis's claims are judged. A pair is a run of `ppo` and one of `acppo` with the same game and seed. Each pair
+has a margin for each claim, above 0 where it has the claim's sign:
+    score            final `mean_return_100`, acppo - ppo (across games in units of human minus random score)
+    KL               log of the ratio of the means of `losses/kl`, ppo / acppo
+    relative spikes  share of iterations with a KL above the 99th percentile of ppo's in the same game (all its seeds),
+                     ppo - acppo
+    own spikes       share of iterations with a KL above ten times the run's own median, ppo - acppo
+    clip ratio       0.02 - |mean of `losses/avg_clip_ratio` - 0.1|, so above 0 from 0.08 to 0.12; of acppo's runs alone
 On one game a claim holds where every margin is above 0, and does not hold where every margin is below 0; else the two
 cannot be told apart with these runs. Across games the same is asked of both ends of the 95 % interval of the
 interquartile mean of all margins. With fewer than three pairs, on the game or on any of the games, the two cannot be
-told apart at all: of two equal algorithms two pairs agree every second time, three still every fourth.
+told apart at all: of two equal algorithms two pairs agree every second time, three still every fourth. This rule was
+committed eight minutes into the first two of the runs (8073f69), before any had ended; that all runs of a game are cut
+at one step, not each pair at its own, was added when the seeds had come to different lengths.
 
 The interquartile mean is the mean of the middle half of the sorted values, those on its border counting with the part
 of them that is inside (scipy's trim_mean counts them whole). Its interval is the percentile bootstrap that draws seeds
-with replacement within each game. It never is a plain mean: the human score of DoubleDunk is 2.2 points above random.
+with replacement within each game. From three seeds it is too narrow: of two equal algorithms, three normal pairs on
+each of five games, it excludes 0 one time in ten, not in twenty (tests/test_figures.py counts). It never is a plain
+mean: the human score of DoubleDunk is 2.2 points above random.
 """
 
 import itertools
@@ -49,6 +55,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for wrappers.py, where nothing is installed
 from wrappers import FRAME_SKIP, find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -59,19 +66,32 @@ LOSSES = "kl old_approx_kl avg_clip_ratio clipfrac tv_distance max_tv_distance m
 TAGS = {"mean_return_100": "charts/mean_return_100", **{name: f"losses/{name}" for name in LOSSES}}
 KEY = ["variant", "game", "seed"]
 RUN_COLUMNS = [*KEY, *"steps total_timesteps command arguments commit versions machine threads".split()]
-CURVE_COLUMNS = [*KEY, "step", *TAGS]
+CURVE_COLUMNS = [*KEY, "step", *TAGS, "games_ended"]  # the last: since the start
 PLACE = ("commit", "machine", "threads")  # what of a run's provenance has a column of its own; the rest are versions
 
 FEWEST_PAIRS = 3
 UNDECIDED = "cannot be told apart with these runs"
-# Claim → what it says, and the unit of its margins across games
+# Claim → what it says; how a margin across games is written, and what is said of it
 CLAIMS = {
-    "score": ("AC-PPO's final score is above PPO's", "of human minus random score"),
-    "KL": ("AC-PPO's KL between policy updates is smaller", "in the logarithm of the mean KL"),
-    "spikes": ("AC-PPO has fewer KL spikes (above the 99th percentile of PPO's)", "of all iterations"),
-    "jumps": ("AC-PPO has fewer KL spikes (above ten times the run's own median)", "of all iterations"),
-    "clip ratio": ("AC-PPO's average clip ratio is near 0.1 (0.08 to 0.12)", "inside the band"),
+    "score": ("AC-PPO's final score is above PPO's", "{:+.3f}".format, "{} of human minus random score"),
+    "KL": (
+        "AC-PPO's KL between policy updates is smaller",
+        lambda margin: f"{math.exp(margin):.2f}",
+        "PPO's mean KL is {} times AC-PPO's",
+    ),
+    "relative spikes": (
+        "AC-PPO has fewer KL spikes above the 99th percentile of PPO's",
+        "{:+.2%}".format,
+        "{} of all iterations",
+    ),
+    "own spikes": (
+        "AC-PPO has fewer KL spikes above ten times the run's own median",
+        "{:+.2%}".format,
+        "{} of all iterations",
+    ),
+    "clip ratio": ("AC-PPO's average clip ratio is near 0.1 (0.08 to 0.12)", "{:+.4f}".format, "{} inside the band"),
 }
+SIGNS = {"holds": "✓", "does not hold": "✗", UNDECIDED: "?"}
 DRAWS = 10_000  # of the bootstrap
 
 # Figure → its title and the columns it shows, each with its y axis
@@ -123,13 +143,8 @@ def collect(out: Path) -> None:
     for directory in sorted(path for path in (out / "runs").iterdir() if path.is_dir()):
         try:
             run, curve = read_run(directory)
-        except (
-            OSError,
-            ValueError,
-            LookupError,
-            TypeError,
-            AttributeError,
-        ) as error:  # whatever is not as it should be
+        # Whatever something that is not as it should be raises
+        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
             print(f"{directory}: left out ({type(error).__name__}: {error})", file=sys.stderr)
             continue
         key = tuple(run[name] for name in KEY)
@@ -159,11 +174,17 @@ def collect(out: Path) -> None:
 def read_run(directory: Path) -> tuple[dict, pd.DataFrame]:
     """Returns a run's row of runs.csv and its rows of curves.csv."""
     record = json.loads((directory / "args.json").read_text())
-    args, provenance = record["args"], record["provenance"]
+    args, readers = record["args"], read_events(directory)
     key = dict(zip(KEY, (args["exp_name"], args["env_id"], args["seed"])))
-    curve = read_curve(directory)
+    curve = read_curve(readers)
     if not len(curve):
         raise ValueError("it has no iterations")
+    # args.json has the last start's; where starts differ, each value counts once
+    starts = read_provenance(readers) or [record["provenance"]]
+    provenance = {
+        name: "; ".join(dict.fromkeys(str(start.get(name, "unknown")) for start in starts))
+        for name in record["provenance"]
+    }
     versions = {name: version for name, version in provenance.items() if name not in PLACE}
     run = {
         **key,
@@ -178,25 +199,43 @@ def read_run(directory: Path) -> tuple[dict, pd.DataFrame]:
     return run, curve.reset_index().assign(**key)[CURVE_COLUMNS]
 
 
-def read_curve(directory: Path) -> pd.DataFrame:
-    """Returns all points of the tags in TAGS, (iterations, tags) by agent step; of a step logged twice, the last."""
-    points = []
-    for file in sorted(directory.glob("events.out.tfevents*")):
-        reader = EventAccumulator(str(file), size_guidance={"scalars": 0})  # 0: every point
-        reader.Reload()
+def read_events(directory: Path) -> list[EventAccumulator]:
+    """Reads a run's event files, every point of them."""
+    files = sorted(directory.glob("events.out.tfevents*"))
+    return [EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload() for file in files]
+
+
+def read_curve(readers: list[EventAccumulator]) -> pd.DataFrame:
+    """Returns the tags in TAGS by agent step, and the games ended so far; of a step logged twice, the last."""
+    points, game_ends = [], []
+    for reader in readers:
+        logged = reader.Tags()["scalars"]
         for column, tag in TAGS.items():
-            if tag in reader.Tags()["scalars"]:
+            if tag in logged:
                 points += [(event.wall_time, event.step, column, event.value) for event in reader.Scalars(tag)]
+        if "charts/episodic_return" in logged:
+            game_ends += [event.step for event in reader.Scalars("charts/episodic_return")]
     points.sort(key=lambda point: point[0])
     table = pd.DataFrame(points, columns=["time", "step", "column", "value"])
     table = table.drop_duplicates(["step", "column"], keep="last")
-    return table.pivot(index="step", columns="column", values="value").reindex(columns=list(TAGS)).sort_index()
+    table = table.pivot(index="step", columns="column", values="value").reindex(columns=list(TAGS)).sort_index()
+    return table.assign(games_ended=np.searchsorted(np.sort(game_ends), table.index, side="right"))
+
+
+def read_provenance(readers: list[EventAccumulator]) -> list[dict[str, str]]:
+    """Returns what each start of a run wrote of itself to TensorBoard, from the first to the last."""
+    tag, texts = "provenance/text_summary", []
+    for reader in readers:
+        texts += reader.Tensors(tag) if tag in reader.Tags()["tensors"] else []
+    tables = [text.tensor_proto.string_val[0].decode() for text in sorted(texts, key=lambda text: text.wall_time)]
+    return [dict(line.strip("|").split("|", 1) for line in table.splitlines()) for table in tables]
 
 
 def read_csvs(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Returns OUT/runs.csv and OUT/curves.csv, without rows where there are none yet."""
     tables = []
-    numbers = dict.fromkeys(("seed", "steps", "total_timesteps", "step"), "int64") | dict.fromkeys(TAGS, "float64")
+    numbers = dict.fromkeys(("seed", "steps", "total_timesteps", "step", "games_ended"), "int64")
+    numbers |= dict.fromkeys(TAGS, "float64")
     for name, columns in (("runs.csv", RUN_COLUMNS), ("curves.csv", CURVE_COLUMNS)):
         types = {column: numbers.get(column, "str") for column in columns}
         try:
@@ -213,7 +252,7 @@ def read_csvs(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 # -------------------------------------------------------------------------------------------------- statistics
 def by_run(curves: pd.DataFrame) -> Curves:
-    return {key: rows.set_index("step")[list(TAGS)] for key, rows in curves.groupby(KEY)}
+    return {key: rows.set_index("step").drop(columns=KEY) for key, rows in curves.groupby(KEY)}
 
 
 def variants(curves: Curves) -> list[str]:
@@ -231,10 +270,17 @@ def seeds(curves: Curves, variant: str, game: str) -> dict[int, pd.DataFrame]:
     return {key[2]: curve for key, curve in curves.items() if key[:2] == (variant, game)}
 
 
-def cut(curves: Curves, variant: str, game: str) -> list[pd.DataFrame]:
-    """Returns the seeds' curves up to the last step that all of them have reached."""
-    whole = list(seeds(curves, variant, game).values())
-    return [curve.loc[: min(other.index[-1] for other in whole)] for curve in whole]
+def comparable(curves: Curves) -> Curves:
+    """Returns the curves that tables and claims compare: of each game, those at least half as long as its longest, up
+    to the last step that all of these have reached."""
+    compared = {}
+    for game in games(curves):
+        of_game = {key: curve for key, curve in curves.items() if key[1] == game}
+        longest = max(curve.index[-1] for curve in of_game.values())
+        of_game = {key: curve for key, curve in of_game.items() if curve.index[-1] >= longest / 2}
+        end = min(curve.index[-1] for curve in of_game.values())
+        compared |= {key: curve.loc[:end] for key, curve in of_game.items()}
+    return compared
 
 
 def read_scores(of_games: list[str]) -> pd.DataFrame:
@@ -269,42 +315,36 @@ def bootstrap_interval(strata: list[np.ndarray]) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def spike_limit(curves: Curves, game: str, step: int) -> float:
-    """Returns the 99th percentile of the KL of all of ppo's runs up to a step, NaN where there are none."""
-    kl = [curve.kl.loc[:step] for curve in seeds(curves, "ppo", game).values()]
+def spike_limit(curves: Curves, game: str) -> float:
+    """Returns the 99th percentile of the KL of all of ppo's runs, NaN where there are none."""
+    kl = [curve.kl for curve in seeds(curves, "ppo", game).values()]
     return float(np.quantile(pd.concat(kl), 0.99)) if kl else math.nan
 
 
-def share_above(kl: pd.Series, limit: float) -> float:
-    return float((kl > limit).mean()) if math.isfinite(limit) else math.nan
+def share_above(values: pd.Series, limit: float) -> float:
+    return float((values > limit).mean()) if math.isfinite(limit) else math.nan
 
 
-def share_of_jumps(kl: pd.Series) -> float:
+def share_of_own_spikes(kl: pd.Series) -> float:
     return share_above(kl, 10 * kl.median())
 
 
 def find_margins(curves: Curves) -> dict[str, dict[str, np.ndarray]]:
-    """Returns claim → game → (pairs,), by the rule in this file's docstring; games without a pair are left out."""
+    """Returns claim → game → (pairs,) by the rule in this file's docstring, without pairs where no game has ended."""
     margins = {claim: {} for claim in CLAIMS}
     for game in games(curves):
         ppos, acppos = seeds(curves, "ppo", game), seeds(curves, "acppo", game)
-        rows = []
-        for seed in sorted(ppos.keys() & acppos.keys()):
-            step = min(ppos[seed].index[-1], acppos[seed].index[-1])
-            ppo, acppo = ppos[seed].loc[:step], acppos[seed].loc[:step]
-            limit = spike_limit(curves, game, step)
-            rows.append(
-                {
-                    "score": acppo.mean_return_100.iloc[-1] - ppo.mean_return_100.iloc[-1],
-                    "KL": np.log(ppo.kl.mean()) - np.log(acppo.kl.mean()),
-                    "spikes": share_above(ppo.kl, limit) - share_above(acppo.kl, limit),
-                    "jumps": share_of_jumps(ppo.kl) - share_of_jumps(acppo.kl),
-                }
-            )
-        rows += [{"clip ratio": 0.02 - abs(acppo.avg_clip_ratio.mean() - 0.1)} for acppo in acppos.values()]
-        for claim, found in pd.DataFrame(rows, columns=list(CLAIMS)).items():
-            if len(found := found.dropna()):  # a score is missing where no game has ended
-                margins[claim][game] = found.to_numpy()
+        limit = spike_limit(curves, game)
+        pairs = [(ppos[seed], acppos[seed]) for seed in sorted(ppos.keys() & acppos.keys())]
+        of_game = {
+            "score": [acppo.mean_return_100.iloc[-1] - ppo.mean_return_100.iloc[-1] for ppo, acppo in pairs],
+            "KL": [np.log(ppo.kl.mean()) - np.log(acppo.kl.mean()) for ppo, acppo in pairs],
+            "relative spikes": [share_above(ppo.kl, limit) - share_above(acppo.kl, limit) for ppo, acppo in pairs],
+            "own spikes": [share_of_own_spikes(ppo.kl) - share_of_own_spikes(acppo.kl) for ppo, acppo in pairs],
+            "clip ratio": [0.02 - abs(acppo.avg_clip_ratio.mean() - 0.1) for acppo in acppos.values()],
+        }
+        for claim, values in of_game.items():
+            margins[claim][game] = np.array([value for value in values if math.isfinite(value)])
     return margins
 
 
@@ -325,8 +365,8 @@ def plus_minus(mean: float, std: float) -> str:
 
 
 def final_scores(curves: Curves, variant: str, game: str) -> np.ndarray:
-    """Returns `mean_return_100` of each seed (seeds,) at the last step that all seeds have reached."""
-    last = [curve.mean_return_100.iloc[-1] for curve in cut(curves, variant, game)]
+    """Returns the last `mean_return_100` of each seed that has ended a game (seeds,)."""
+    last = [curve.mean_return_100.iloc[-1] for curve in seeds(curves, variant, game).values()]
     return np.array([score for score in last if math.isfinite(score)])
 
 
@@ -336,12 +376,13 @@ def score_table(curves: Curves) -> str:
     published = {key: rows.set_index("game") for key, rows in scores.groupby(["agent_steps", "source"], sort=False)}
     table = []
     for game in games(curves):
-        row = [game]
+        row = [game, f"{next(curve for key, curve in curves.items() if key[1] == game).index[-1]:,}"]
         for variant in variants(curves):
             if len(final := final_scores(curves, variant, game)):
                 std = final.std(ddof=1) if len(final) > 1 else math.nan
-                step = cut(curves, variant, game)[0].index[-1]
-                row.append(f"{plus_minus(final.mean(), std)} (n = {len(final)}, {step:,})")
+                fewest = min(curve.games_ended.iloc[-1] for curve in seeds(curves, variant, game).values())
+                of_games = f", {fewest} games" if fewest < 100 else ""
+                row.append(f"{plus_minus(final.mean(), std)} (n = {len(final)}{of_games})")
             else:
                 row.append("–")
         for lines in published.values():
@@ -351,12 +392,13 @@ def score_table(curves: Curves) -> str:
     headings = [source + (f", {steps:,}" if steps else "") for steps, source in published]
     notes = dict.fromkeys(f"{row.source}: {row.note}" for row in scores[scores.note.ne("")].itertuples())
     text = (
-        "Mean score of the last 100 games: mean ± sample standard deviation (ddof 1) over n seeds, at the agent step"
-        " given (on Atari 4 frames each), the last that all n have reached."
+        "Mean score of the last 100 games at the agent step given (on Atari 4 frames each): mean ± sample standard"
+        " deviation (ddof 1) over n seeds. Where a seed had ended fewer than 100 games, the fewest are given, and its"
+        " mean is over all since the start, without the long ones that had not ended."
     )
     if published:
         text += f" Published scores stand under their source and its agent steps ({'; '.join(notes)})."
-    return markdown(["game", *variants(curves), *headings], table) + f"\n{text}\n"
+    return markdown(["game", "agent steps", *variants(curves), *headings], table) + f"\n{text}\n"
 
 
 def in_human_ranges(margins: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -365,10 +407,10 @@ def in_human_ranges(margins: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {game: values / ranges[game][1] for game, values in margins.items() if game in ranges}
 
 
-def mean_and_interval(strata: list[np.ndarray]) -> tuple[str, str]:
+def mean_and_interval(strata: list[np.ndarray], number=lambda value: f"{value:.3f}") -> tuple[str, str]:
     interval = bootstrap_interval(strata)
-    text = "no interval: one seed" if interval is None else "{:.3f} to {:.3f}".format(*interval)
-    return f"{interquartile_mean(np.concatenate(strata)):.3f}", text
+    text = "no interval: one seed" if interval is None else " to ".join(map(number, interval))
+    return number(interquartile_mean(np.concatenate(strata))), text
 
 
 def human_table(curves: Curves) -> str:
@@ -378,7 +420,8 @@ def human_table(curves: Curves) -> str:
     for variant in variants(curves):
         finals = [(final_scores(curves, variant, game) - low) / height for game, (low, height) in ranges.items()]
         strata[variant] = [final for final in finals if len(final)]
-    strata["acppo − ppo, by pairs"] = list(in_human_ranges(find_margins(curves)["score"]).values())
+    pairs = in_human_ranges(find_margins(curves)["score"]).values()
+    strata["acppo − ppo, by pairs"] = [values for values in pairs if len(values)]
     table = []
     for name, finals in strata.items():
         if finals:
@@ -388,98 +431,118 @@ def human_table(curves: Curves) -> str:
         return "None: `benchmark/scores.csv` has no human score of these games.\n"
     return markdown(["", "games", "seeds", "interquartile mean", "95 % interval"], table) + (
         "\nFinal scores as above, (score − random) / (human − random), over games × seeds; the interval draws seeds"
-        "\nwithin each game. Pairs have game and seed in common and are cut at the last step that both have reached.\n"
+        "\nwithin each game. Pairs have game and seed in common.\n"
     )
 
 
-def kl_table(curves: Curves) -> str:
+def kl_table(runs: pd.DataFrame, curves: Curves) -> str:
     """How far an update moves the policy, over all iterations of all seeds."""
     table = []
-    for game in games(curves):
-        for variant in variants(curves):
-            if parts := cut(curves, variant, game):
-                kl = pd.concat([part.kl for part in parts])
-                limit = spike_limit(curves, game, parts[0].index[-1])
-                spikes = f"{share_above(kl, limit):.2%}" if math.isfinite(limit) else "–"
-                jumps = np.mean([share_of_jumps(part.kl) for part in parts])
-                numbers = [f"{number:.3g}" for number in (kl.mean(), kl.median(), kl.quantile(0.99), kl.max())]
-                clip = np.mean([part.avg_clip_ratio.mean() for part in parts])
-                table.append([game, variant, str(len(parts)), f"{parts[0].index[-1]:,}", *numbers])
-                table[-1] += [spikes, f"{jumps:.2%}", f"{clip:.4f}"]
+    for game, variant in itertools.product(games(curves), variants(curves)):
+        if not (of_seeds := list(seeds(curves, variant, game).values())):
+            continue
+        together = pd.concat(of_seeds)
+        numbers = (together.kl.mean(), together.kl.median(), together.kl.quantile(0.99), together.kl.max())
+        shares = (
+            share_above(together.kl, spike_limit(curves, game)),
+            np.mean([share_of_own_spikes(curve.kl) for curve in of_seeds]),
+            share_above(together.max_tv_distance, epsilons(runs).get(variant, math.nan) / 2),
+        )
+        row = [game, variant, str(len(of_seeds)), f"{of_seeds[0].index[-1]:,}"]
+        row += [f"{number:.3g}" for number in numbers]
+        row += [f"{share:.2%}" if math.isfinite(share) else "–" for share in shares]
+        table.append([*row, f"{together.avg_clip_ratio.mean():.4f}"])
     columns = ["game", "variant", "seeds", "agent steps", "mean KL", "median", "99th percentile", "maximum"]
-    columns += ["spikes: above ppo's 99th percentile", "spikes: above 10 × own median", "average clip ratio"]
+    columns += ["spikes: above ppo's 99th percentile", "spikes: above 10 × own median"]
+    columns += ["largest TV distance above ε / 2", "average clip ratio"]
     return markdown(columns, table) + (
         "\nKL between policy updates (`losses/kl`, nats, exact over actions), every iteration of all seeds up to the"
-        "\nlast step that all have reached. ppo's share above its own 99th percentile is about 1 % by definition.\n"
+        "\nagent step given; shares are of iterations. ppo's above its own 99th percentile is about 1 % by definition."
+        "\nThe largest TV distance is over the visited states; ε / 2 bounds it only while every ratio is inside its"
+        "\nrange (proposition 2.4.1).\n"
     )
 
 
-def claim_lines(curves: Curves) -> str:
+def claims_table(curves: Curves) -> str:
     """A line for each claim of the thesis, judged by the rule in this file's docstring."""
-    lines = []
+    table = []
     for claim, margins in find_margins(curves).items():
-        said, unit = CLAIMS[claim]
-        counted = "runs" if claim == "clip ratio" else "pairs"
-        by_verdict: dict[str, list[str]] = {"holds": [], "does not hold": [], UNDECIDED: []}
-        for game, values in margins.items():
-            judged = verdict(len(values), values.min(), values.max())
+        said, number, sentence = CLAIMS[claim]
+        row = [said]
+        for values in margins.values():
+            judged = verdict(len(values), values.min(), values.max()) if len(values) else UNDECIDED
             ties = f", {(values == 0).sum()} equal" if (values == 0).any() else ""
-            by_verdict[judged].append(f"{game} ({(values > 0).sum()} of {len(values)} {counted}{ties})")
-        parts = [f"{judged} on {', '.join(names)}" for judged, names in by_verdict.items() if names]
+            row.append(f"{SIGNS[judged]} {(values > 0).sum()} of {len(values)}{ties}")
         strata = list((in_human_ranges(margins) if claim == "score" else margins).values())
-        if len(strata) > 1:
+        if len(strata) > 1 and any(map(len, strata)):
             low, high = bootstrap_interval(strata) or (-math.inf, math.inf)
             judged = verdict(min(map(len, strata)), low, high)
-            mean, interval = mean_and_interval(strata)
-            parts.insert(0, f"**{judged} across games** (margin {mean} {unit}; {interval})")
-        lines.append(f"- {said}: {'; '.join(parts) or f'no {counted} yet'}.")
-    return "\n".join(lines) + "\n"
+            mean, interval = mean_and_interval(strata, number)
+            row.append(f"{SIGNS[judged]} {judged}: {sentence.format(mean)} ({interval})")
+        else:
+            row.append("–")
+        table.append(row)
+    return markdown(["claim", *games(curves), "across games"], table)
 
 
-def coverage(runs: pd.DataFrame) -> str:
+def coverage(runs: pd.DataFrame, compared: Curves) -> str:
     """Says which runs the results are made of, and how much of their schedule they have done."""
     done = 100 * runs.steps / runs.total_timesteps
     share = " to ".join(dict.fromkeys(f"{percent:.3g} %" for percent in (done.min(), done.max())))
-    names = {name: ", ".join(map(str, sorted(runs[name].unique()))) for name in [*KEY, "commit", "machine"]}
+    names = {name: ", ".join(map(str, sorted(runs[name].unique()))) for name in KEY}
+    commits = sorted({commit[:7] for of_run in runs.commit for commit in of_run.split("; ")})
+    machines = sorted({machine for of_run in runs.machine for machine in of_run.split("; ")})
     schedules = " or ".join(f"{steps:,}" for steps in sorted(runs.total_timesteps.unique()))
     text = (
         f"{len(runs)} runs (variants {names['variant']}; games {names['game']}; seeds {names['seed']}), at {share} of a"
+        f" schedule of {schedules} agent steps."
     )
-    text += f" schedule of {schedules} agent steps."
     if done.min() < 99:
         text += " What stands here is so at these steps, and says nothing about the schedule's end."
+    left_out = [
+        f"{key[1]} {key[0]} {key[2]}" for key in runs[KEY].itertuples(index=False, name=None) if key not in compared
+    ]
+    if left_out:
+        text += f" In the figures alone, being shorter than half of their game's longest run: {', '.join(left_out)}."
     return (
-        f"{text} Commit {names['commit']}; {names['machine']}; each run's arguments and versions are in `runs.csv`.\n"
+        f"{text} Commits {', '.join(commits)}; {', '.join(machines)}; each run's arguments, versions and whole commit"
+        " are in `runs.csv`.\n"
     )
 
 
-JUDGED = f"""The thesis's claims. A game is judged by its pairs of ppo and acppo with the same seed: there must be
-{FEWEST_PAIRS} or more, and all must agree; in brackets, how many have the claim's sign. Across games, the 95 % interval
-of the margins' interquartile mean must exclude 0. The whole rule, written before the runs, opens
-`benchmark/figures.py`.
+JUDGED = f"""The thesis's claims: ✓ holds, ✗ does not hold, ? {UNDECIDED}. A game is judged by
+its pairs of ppo and acppo with the same seed (the clip ratio by runs of acppo): {FEWEST_PAIRS} or more must be there,
+and all must agree; the table counts those with the claim's sign. Across games, the 95 % interval of the margins'
+interquartile mean must exclude "no difference"; with three seeds a game it does so for two equal algorithms one
+time in ten, not in twenty. The whole rule, and since when it stands, opens `benchmark/figures.py`.
 """
 
 
 def tables_text(out: Path) -> str:
     """Returns OUT/tables.md."""
     runs, rows = read_csvs(out)
-    curves = by_run(rows)
-    parts = ["# Tables\n", "Made by `benchmark/figures.py` from `runs.csv` and `curves.csv`.\n", coverage(runs)]
+    curves = comparable(by_run(rows))
+    parts = ["# Tables\n", "Made by `benchmark/figures.py` from `runs.csv` and `curves.csv`.\n", coverage(runs, curves)]
     parts += ["## Final score\n", score_table(curves), "## Human-normalised score\n", human_table(curves)]
-    parts += ["## KL between policy updates, and clip ratio\n", kl_table(curves), "## Claims\n", JUDGED]
-    return "\n".join([*parts, claim_lines(curves)])
+    parts += ["## KL between policy updates, and clip ratio\n", kl_table(runs, curves), "## Claims\n", JUDGED]
+    return "\n".join([*parts, claims_table(curves)])
 
 
 def results_section(out: Path, readme: Path = ROOT / "README.md") -> str:
     """Returns what a README says about the results in OUT, its links relative to the README."""
     runs, rows = read_csvs(out)
     curves = by_run(rows)
+    compared = comparable(curves)
     link = Path(os.path.relpath(out.resolve(), readme.resolve().parent)).as_posix()
-    parts = [coverage(runs)]
-    for name, tables in (("score", [score_table(curves), human_table(curves)]), ("kl", [JUDGED, claim_lines(curves)])):
+    parts = [coverage(runs, compared)]
+    tables_below = {
+        "score": [score_table(compared), human_table(compared)],
+        "kl": [kl_table(runs, compared), JUDGED, claims_table(compared)],
+    }
+    for name, tables in tables_below.items():
         parts += [f"![{FIGURES[name][0]}. {captions(runs, curves)[name]}]({link}/figures/{name}.png)\n", *tables]
     names = ", ".join(f"[{name}]({link}/figures/{name}.svg)" for name in FIGURES)
-    parts += [f"KL and clip ratio in numbers: [tables.md]({link}/tables.md). All figures: {names}.\n"]
+    parts += [f"All figures: {names}.\n"]
     return "\n".join(parts)
 
 
@@ -518,8 +581,11 @@ def captions(runs: pd.DataFrame, curves: Curves) -> dict[str, str]:
     band = "One seed, so no band."
     if runs.seed.nunique() > 1:
         band = "Line and band: mean ± sample standard deviation (ddof 1) over the n seeds that a panel's title gives, "
-        band += "as far as all of them have got; thin: each seed. Where n = 1 there is no band."
-    spikes = "Thin: every iteration of each seed. Thick: running median over a twentieth of them, then over the seeds."
+        band += "as far as all of a variant's have got; thin: each seed. Where n = 1 there is no band."
+    spikes = (
+        "Thin: every iteration of each seed. Thick: running median over a twentieth of them, then over a variant's "
+    )
+    spikes += "seeds, as far as all have got."
     kl = pd.concat([curve.kl for curve in curves.values()]).median()
     args = json.loads(runs.arguments.iloc[0])
     samples = args["num_envs"] * args["num_steps"]
@@ -552,8 +618,10 @@ def draw_figure(name: str, caption: str, runs: pd.DataFrame, curves: Curves) -> 
         axis = next(axes)
         counts = {variant: len(seeds(curves, variant, game)) for variant in variants(curves)}
         counts = {variant: n for variant, n in counts.items() if n}
-        n = " to ".join(str(n) for n in dict.fromkeys((min(counts.values()), max(counts.values()))))
-        axis.set_title(f"{game} (n = {n})", fontsize="medium")
+        n = {f"n = {n}": variant for variant, n in counts.items()}
+        if len(n) > 1:
+            n = [f"{variant} n = {n}" for variant, n in counts.items()]
+        axis.set_title(f"{game} ({', '.join(n)})", fontsize="medium")
         draw_panel(axis, curves, game, column)
         lines = {"ppo": PPO_EPSILON} if name == "avg_clip_ratio" else {}
         if name == "tv_distance":
@@ -587,11 +655,13 @@ def draw_panel(axis: Axes, curves: Curves, game: str, column: str) -> None:
             axis.fill_between(x, middle - std, middle + std, color=look["color"], alpha=0.2, linewidth=0)
         else:  # has spikes, or noise from one iteration to the next
             window = max(1, len(table) // 20)
-            middle = table.rolling(window, center=True, min_periods=1).median().median(axis=1, skipna=False)
+            running = table.rolling(window, center=True, min_periods=1).median()
+            middle = running.where(table.notna()).median(axis=1, skipna=False)
         pixels = len(table) > 1000  # in the SVG too, where a line of 5,000 points in every panel makes megabytes
         axis.plot(x, table, color=look["color"], linewidth=0.6, alpha=0.4, rasterized=pixels)
-        edge = withStroke(linewidth=4, foreground="white")  # against the mass of its own colour in long runs
-        axis.plot(x, middle, linewidth=2, zorder=3, path_effects=[edge], **look)
+        # A white edge against the mass of its own colour in long runs; a score's would hide the other variant
+        edge = [] if column == "mean_return_100" else [withStroke(linewidth=4, foreground="white")]
+        axis.plot(x, middle, linewidth=2, zorder=3, path_effects=edge, **look)
     if column == "old_approx_kl":  # has both signs: linear up to about its median size
         median = pd.concat([curve.kl for curve in curves.values()]).median()
         axis.set_yscale("symlog", linthresh=10.0 ** round(math.log10(median)) if median > 0 else 1)
@@ -619,9 +689,9 @@ def main() -> None:
     readme = args.readme or (ROOT / "README.md" if args.out.resolve() == DEFAULT_OUT else None)
     if args.readme and split_readme(args.readme) is None:
         refuse(f"--readme {args.readme}", f"has no {MARKERS[0]} … {MARKERS[1]}, once, to write between")
-    if not (args.out / "runs").is_dir() and not (args.out / "curves.csv").exists():
-        refuse(f"--out {args.out}", "has neither runs nor their CSVs; run benchmark/atari5.py first")
     try:
+        if not (args.out / "runs").is_dir() and not (args.out / "curves.csv").exists():
+            refuse(f"--out {args.out}", "has neither runs nor their CSVs; run benchmark/atari5.py first")
         collect(args.out)
         if not all(map(len, read_csvs(args.out))):
             refuse(f"--out {args.out}", "no run there has an iteration yet")
@@ -631,7 +701,7 @@ def main() -> None:
         elif readme:
             print(f"{readme}: left as it is, it has no {MARKERS[0]} … {MARKERS[1]}", file=sys.stderr)
     except OSError as error:
-        refuse(error.filename or args.out, f"cannot be written ({error.strerror})")
+        refuse(error.filename or args.out, f"cannot be used ({error.strerror})")
     print(f"{args.out}: runs.csv, curves.csv, figures/, tables.md")
 
 

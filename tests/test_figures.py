@@ -48,7 +48,8 @@ def make_csvs(out, runs: dict[tuple, dict]) -> figures.Curves:
     """Writes the two CSVs: (variant, game, seed) → column → a value an iteration; what is not given is 0.1."""
     rows, curves = [], []
     for (variant, game, seed), columns in runs.items():
-        curve = pd.DataFrame(columns).reindex(columns=list(figures.TAGS), fill_value=0.1)
+        curve = pd.DataFrame({"games_ended": 100, **columns})
+        curve = curve.reindex(columns=["games_ended", *figures.TAGS], fill_value=0.1)
         curve["step"] = BATCH * np.arange(1, len(curve) + 1)
         key = {"variant": variant, "game": game, "seed": seed}
         curves.append(curve.assign(**key))
@@ -88,7 +89,7 @@ def cells(markdown: str) -> list[list[str]]:
 # ----------------------------------------------------------------------------------------------------- collect
 def test_all_of_20000_points_are_read(tmp_path):
     directory = make_run(tmp_path, kl=range(20_000))
-    curve = figures.read_curve(directory)
+    curve = figures.read_curve(figures.read_events(directory))
     assert list(curve.index) == [BATCH * i for i in range(1, 20_001)]
     assert list(curve.kl) == list(range(20_000))
 
@@ -98,7 +99,7 @@ def test_a_step_that_was_logged_twice_keeps_what_was_written_last(tmp_path):
     log(directory, {"losses/kl": {3: 30, 4: 40, 5: 50}, "losses/clipfrac": {5: 0.5}}, suffix=".resumed")
     log(directory, {"losses/kl": {1: -1}}, suffix=".the-last-name-but-the-first-to-be-written", time=1.0)
     log(directory, {"losses/kl": {5: 55}}, suffix=".again")
-    curve = figures.read_curve(directory)
+    curve = figures.read_curve(figures.read_events(directory))
     assert list(curve.kl) == [1, 2, 30, 40, 55]
     assert curve.clipfrac.iloc[-1] == 0.5 and curve.clipfrac[:-1].isna().all()
 
@@ -112,7 +113,22 @@ def test_a_run_gives_a_row_and_its_iterations_with_six_digits(tmp_path):
     assert json.loads(run.versions) == {"python": "3.12", "torch": "2.13.0"}
     assert json.loads(run.arguments) == make_arguments("acppo", "CartPole-v1", 7)
     lines = (tmp_path / "curves.csv").read_text().splitlines()
-    assert lines[1:] == ["acppo,CartPole-v1,7,1024,9,0.333333,,,,,,", "acppo,CartPole-v1,7,2048,10,3.33333e-06,,,,,,"]
+    expected = ["acppo,CartPole-v1,7,1024,9,0.333333,,,,,,,0", "acppo,CartPole-v1,7,2048,10,3.33333e-06,,,,,,,0"]
+    assert lines[1:] == expected
+
+
+def test_games_are_counted_where_they_ended_and_starts_where_they_differ(tmp_path):
+    directory = make_run(tmp_path, kl=[1, 2, 3])
+    writer = SummaryWriter(str(directory), filename_suffix=".games")
+    for step in (100, 1024, 1025, 1025, 3000):  # two games may end in one step
+        writer.add_scalar("charts/episodic_return", 0.0, step)
+    for commit, machine in (("abc", "one"), ("def", "one"), ("abc", "other")):
+        writer.add_text("provenance", f"|name|value|\n|-|-|\n|commit|{commit}|\n|machine|{machine}|")
+    writer.close()
+    figures.collect(tmp_path)
+    runs, curves = figures.read_csvs(tmp_path)
+    assert list(curves.games_ended) == [2, 4, 5]
+    assert (runs.commit[0], runs.machine[0], runs.threads[0]) == ("abc; def", "one; other", "unknown")
 
 
 def test_runs_without_a_directory_keep_their_rows_and_found_ones_replace_theirs(tmp_path, capsys):
@@ -181,76 +197,119 @@ def test_the_interval_is_that_of_all_ways_to_redraw_seeds_within_games():
     assert figures.bootstrap_interval([np.zeros(3), np.zeros(1)]) is None
 
 
-def test_both_spike_rates_as_counted_by_hand_up_to_the_last_common_step(tmp_path):
+def test_the_interval_of_three_pairs_a_game_excludes_no_difference_one_time_in_ten(monkeypatch):
+    """For two equal algorithms a 95 % interval should do so one time in twenty; the text beside the claims says ten."""
+    monkeypatch.setattr(figures, "DRAWS", 1000)
+    generator = np.random.default_rng(1)
+    intervals = [figures.bootstrap_interval(list(generator.standard_normal((5, 3)))) for _ in range(1000)]
+    assert 0.08 < np.mean([low > 0 or high < 0 for low, high in intervals]) < 0.12
+
+
+def test_runs_of_a_game_are_compared_at_one_step_without_those_shorter_than_half(tmp_path):
+    lengths = {("ppo", "Pong", 1): 10, ("ppo", "Pong", 2): 7, ("ppo", "Pong", 3): 4, ("acppo", "Pong", 1): 5}
+    runs = {key: {"kl": range(length)} for key, length in lengths.items()} | {("ppo", "Qbert", 1): {"kl": range(3)}}
+    curves = make_csvs(tmp_path, runs)
+    compared = figures.comparable(curves)
+    assert {key: list(curve.kl) for key, curve in compared.items()} == {
+        ("ppo", "Pong", 1): [0, 1, 2, 3, 4],
+        ("ppo", "Pong", 2): [0, 1, 2, 3, 4],
+        ("acppo", "Pong", 1): [0, 1, 2, 3, 4],
+        ("ppo", "Qbert", 1): [0, 1, 2],
+    }
+    said = figures.coverage(figures.read_csvs(tmp_path)[0], compared)
+    assert "In the figures alone, being shorter than half of their game's longest run: Pong ppo 3." in said
+
+
+def test_both_spike_rates_as_counted_by_hand(tmp_path):
     ppo = [1] * 93 + [9] * 2 + [20] * 5  # 99th percentile 20, median 1
     acppo = [1] * 97 + [30] * 3
-    curves = make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": ppo + [99] * 50}, ("acppo", "Pong", 1): {"kl": acppo}})
+    curves = make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}})
     margins = figures.find_margins(curves)
-    assert margins["spikes"]["Pong"] == pytest.approx([0 - 0.03])
-    assert margins["jumps"]["Pong"] == pytest.approx([0.05 - 0.03])
+    assert margins["relative spikes"]["Pong"] == pytest.approx([0 - 0.03])
+    assert margins["own spikes"]["Pong"] == pytest.approx([0.05 - 0.03])
     assert margins["KL"]["Pong"] == pytest.approx([math.log(2.11 / 1.87)])
-    (ppo_row, acppo_row) = cells(
-        figures.kl_table(make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}}))
-    )[2:]
-    assert ppo_row == ["Pong", "ppo", "1", "102,400", "2.11", "1", "20", "20", "0.00%", "5.00%", "0.1000"]
-    assert acppo_row == ["Pong", "acppo", "1", "102,400", "1.87", "1", "30", "30", "3.00%", "3.00%", "0.1000"]
+    ppo_row, acppo_row = cells(figures.kl_table(figures.read_csvs(tmp_path)[0], curves))[2:]
+    # The TV distance is 0.1: above PPO's 0.1 / 2, above AC-PPO's 0.16 / 2
+    assert ppo_row == ["Pong", "ppo", "1", "102,400", "2.11", "1", "20", "20", "0.00%", "5.00%", "100.00%", "0.1000"]
+    assert acppo_row[4:] == ["1.87", "1", "30", "30", "3.00%", "3.00%", "100.00%", "0.1000"]
+
+
+def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have(tmp_path):
+    kl = {("ppo", "Pong", 1): [1] * 100, ("ppo", "Pong", 2): [1] * 90 + [9] * 10, ("acppo", "Pong", 1): [1] * 99 + [5]}
+    curves = make_csvs(tmp_path, {key: {"kl": values} for key, values in kl.items()})
+    assert figures.spike_limit(curves, "Pong") == 9
+    assert figures.find_margins(curves)["relative spikes"]["Pong"] == [0]  # a 5 is one for seed 1 alone
+    rows = cells(figures.kl_table(figures.read_csvs(tmp_path)[0], curves))[2:]
+    assert [row[8:10] for row in rows] == [["0.00%", "0.00%"], ["0.00%", "0.00%"]]  # 5 and 9 are not above ten times 1
+    assert rows[0][2:8] == ["2", "102,400", "1.4", "1", "9", "9"]
 
 
 @pytest.mark.parametrize(
     ("differences", "judged"),
     [
-        ([1, 2, 3], "holds on Pong (3 of 3 pairs)"),
-        ([-1, -2, -3], "does not hold on Pong (0 of 3 pairs)"),
-        ([1, 2, -3], "cannot be told apart with these runs on Pong (2 of 3 pairs)"),
-        ([1, 2, 0], "cannot be told apart with these runs on Pong (2 of 3 pairs, 1 equal)"),
-        ([1, 2], "cannot be told apart with these runs on Pong (2 of 2 pairs)"),
-        ([-1], "cannot be told apart with these runs on Pong (0 of 1 pairs)"),
-        ([math.nan, 1, 1, 1], "holds on Pong (3 of 3 pairs)"),
+        ([1, 2, 3], "✓ 3 of 3"),
+        ([-1, -2, -3], "✗ 0 of 3"),
+        ([1, 2, -3], "? 2 of 3"),
+        ([1, 2, 0], "? 2 of 3, 1 equal"),
+        ([1, 2], "? 2 of 2"),
+        ([-1], "? 0 of 1"),
+        ([math.nan, 1, 1, 1], "✓ 3 of 3"),
     ],
 )
 def test_a_claim_holds_on_a_game_where_three_or_more_pairs_all_have_its_sign(differences, judged, tmp_path):
     curves = make_pairs(tmp_path, {"Pong": differences})
-    assert figures.claim_lines(curves).splitlines()[0] == f"- AC-PPO's final score is above PPO's: {judged}."
+    header, _, score, *_ = cells(figures.claims_table(curves))
+    assert header == ["claim", "Pong", "across games"]
+    assert score == ["AC-PPO's final score is above PPO's", judged, "–"]
 
 
 @pytest.mark.parametrize(
     ("pong", "breakout", "judged"),
     [
-        ([5, 6, 7], [1, 2, 3], "holds"),
-        ([-5, -6, -7], [-1, -2, -3], "does not hold"),
-        ([5, 6, 7], [-4, -5, -6], "cannot be told apart with these runs"),
-        ([5, 6, 7], [1, 2], "cannot be told apart with these runs"),
-        ([5, 6, 7], [1], "cannot be told apart with these runs"),
+        ([5, 6, 7], [1, 2, 3], "✓ holds"),
+        ([-5, -6, -7], [-1, -2, -3], "✗ does not hold"),
+        ([5, 6, 7], [-4, -5, -6], "? cannot be told apart with these runs"),
+        ([5, 6, 7], [1, 2], "? cannot be told apart with these runs"),
+        ([5, 6, 7], [1], "? cannot be told apart with these runs"),
     ],
 )
 def test_a_claim_is_judged_across_games_by_its_interval(pong, breakout, judged, tmp_path):
     curves = make_pairs(tmp_path, {"Pong": pong, "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
     strata = [np.array(breakout) / (30.5 - 1.7), np.array(pong) / (14.6 + 20.7)]  # CartPole has no human score
     mean, interval = figures.interquartile_mean(np.concatenate(strata)), figures.bootstrap_interval(strata)
-    shown = "no interval: one seed" if interval is None else "{:.3f} to {:.3f}".format(*interval)
-    line = figures.claim_lines(curves).splitlines()[0]
-    assert f"**{judged} across games** (margin {mean:.3f} of human minus random score; {shown})" in line
+    shown = "no interval: one seed" if interval is None else "{:+.3f} to {:+.3f}".format(*interval)
+    across = cells(figures.claims_table(curves))[2][-1]
+    assert across == f"{judged}: {mean:+.3f} of human minus random score ({shown})"
+
+
+def test_a_game_without_a_pair_leaves_the_claim_across_games_undecided(tmp_path):
+    make_pairs(tmp_path, {"Pong": [5, 6, 7], "Breakout": [1, 2, 3]})
+    runs, curves = figures.read_csvs(tmp_path)
+    alone = curves[curves.game.eq("Pong") & curves.variant.eq("ppo")].assign(game="Qbert")
+    score = cells(figures.claims_table(figures.by_run(pd.concat([curves, alone]))))[2]
+    assert score[1:4] == ["✓ 3 of 3", "✓ 3 of 3", "? 0 of 0"]
+    assert score[4].startswith("? cannot be told apart with these runs: +")
 
 
 def test_a_clip_ratio_holds_inside_its_band_for_every_run(tmp_path):
-    for ratio, judged in ((0.119, "holds"), (0.121, "does not hold"), (0.079, "does not hold")):
+    for ratio, judged in ((0.119, "✓ 3 of 3"), (0.121, "✗ 0 of 3"), (0.079, "✗ 0 of 3")):
         curves = make_pairs(tmp_path, {"Pong": [0, 0, 0]}, avg_clip_ratio=[ratio, ratio])
-        assert figures.claim_lines(curves).splitlines()[-1].split(": ")[1].startswith(f"{judged} on Pong")
+        assert cells(figures.claims_table(curves))[-1][1] == judged
 
 
 # ------------------------------------------------------------------------------------------ tables and figures
-def test_the_score_table_gives_mean_and_sample_deviation_where_all_seeds_are(tmp_path):
+def test_the_score_table_gives_mean_and_sample_deviation_and_says_where_games_are_few(tmp_path):
     runs = {
-        ("ppo", "BattleZone", 1): {"mean_return_100": [0, 10, 99]},
-        ("ppo", "BattleZone", 2): {"mean_return_100": [0, 20]},
-        ("acppo", "BattleZone", 1): {"mean_return_100": [0, 12]},
-        ("acppo", "CartPole-v1", 1): {"mean_return_100": [math.nan, math.nan]},
+        ("ppo", "BattleZone", 1): {"mean_return_100": [0, 10], "games_ended": [9, 120]},
+        ("ppo", "BattleZone", 2): {"mean_return_100": [0, 20], "games_ended": [8, 99]},
+        ("acppo", "BattleZone", 1): {"mean_return_100": [0, 12], "games_ended": [8, 100]},
+        ("acppo", "CartPole-v1", 1): {"mean_return_100": [math.nan, math.nan], "games_ended": 0},
     }
     header, _, battle_zone, cartpole = cells(figures.score_table(make_csvs(tmp_path, runs)))
-    assert battle_zone[:3] == ["BattleZone", "15.0 ± 7.1 (n = 2, 2,048)", "12.0 (n = 1, 2,048)"]
+    assert battle_zone[:4] == ["BattleZone", "2,048", "15.0 ± 7.1 (n = 2, 99 games)", "12.0 (n = 1)"]
     ppo2 = header.index("openai/baselines ppo2 (CleanRL docs/benchmark), 10,000,000")
     assert battle_zone[ppo2] == "19,980.0 ± 1,355.2"
-    assert cartpole == ["CartPole-v1"] + ["–"] * (len(header) - 1)
+    assert cartpole == ["CartPole-v1", "2,048"] + ["–"] * (len(header) - 2)
 
 
 def test_the_human_normalised_table_says_where_seeds_are_too_few_for_an_interval(tmp_path):
@@ -275,6 +334,15 @@ def test_mean_and_band_are_over_seeds_as_far_as_all_have_got(tmp_path):
     curves = make_csvs(tmp_path, {("ppo", "Pong", seed): {"mean_return_100": of} for seed, of in scores.items()})
     figures.draw_panel(axis, curves, "Pong", "mean_return_100")
     np.testing.assert_equal(axis.lines[-1].get_ydata(), [2, 4, math.nan])
+    kl = Figure().subplots()
+    figures.draw_panel(
+        kl,
+        make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": range(1, 61)}, ("ppo", "Pong", 2): {"kl": range(1, 41)}}),
+        "Pong",
+        "kl",
+    )
+    drawn = kl.lines[-1].get_ydata()
+    assert np.isfinite(drawn[:40]).all() and np.isnan(drawn[40:]).all()
     band = axis.collections[0].get_paths()[0].vertices
     assert band[:, 1].min() == pytest.approx(2 - math.sqrt(2)) and band[:, 1].max() == pytest.approx(4 + math.sqrt(8))
 
@@ -334,10 +402,28 @@ def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, ca
 
 
 def test_the_results_in_the_repository_are_those_of_its_csvs():
-    if not (figures.DEFAULT_OUT / "curves.csv").exists():
-        pytest.skip("benchmark/results has no curves.csv yet")
-    if (parts := figures.split_readme(ROOT / "README.md")) is None:
-        pytest.skip("the README has no results section yet")
+    parts = figures.split_readme(ROOT / "README.md")
+    assert parts is not None, "the README has lost the place of its results"
     readme, section = (ROOT / "README.md").read_text(), figures.results_section(figures.DEFAULT_OUT)
     assert readme == f"{figures.MARKERS[0]}\n{section}{figures.MARKERS[1]}".join(parts), "run benchmark/figures.py"
     assert (figures.DEFAULT_OUT / "tables.md").read_text() == figures.tables_text(figures.DEFAULT_OUT)
+
+
+def test_a_figure_says_game_seeds_units_and_bounds(tmp_path):
+    keys = [("ppo", "BattleZone", 1), ("ppo", "BattleZone", 2), ("acppo", "BattleZone", 1), ("ppo", "CartPole-v1", 1)]
+    curves = make_csvs(tmp_path, {key: {"kl": [0.1, 0.2, 0.1]} for key in keys})
+    runs = figures.read_csvs(tmp_path)[0]
+    drawn = {
+        name: figures.draw_figure(name, text, runs, curves) for name, text in figures.captions(runs, curves).items()
+    }
+    for name, figure in drawn.items():
+        titles = [axis.get_title() for axis in figure.axes if axis.axison]
+        assert set(titles) == {"BattleZone (ppo n = 2, acppo n = 1)", "CartPole-v1 (n = 1)"}
+        assert {axis.get_xlabel() for axis in figure.axes[:2]} == {"emulator frames (4 a step)", "agent steps"}
+        assert figure.axes[0].get_ylabel() == next(iter(figures.FIGURES[name][1].values()))
+    # PPO's ε 0.1 in the clip ratio, ε / 2 of both variants in the TV distance
+    level = {
+        name: [float(line.get_ydata()[0]) for line in drawn[name].axes[0].lines if line.get_linestyle() == "--"]
+        for name in drawn
+    }
+    assert level["avg_clip_ratio"] == [0.1] and sorted(level["tv_distance"]) == [0.05, 0.08]

@@ -16,6 +16,7 @@ own directories, OUT/logs what each of them was started with and has printed. Ex
 import contextlib
 import ctypes
 import fcntl
+import importlib.util
 import itertools
 import logging
 import math
@@ -50,15 +51,20 @@ VARIANTS = {
     "ppo-eps0.05": ("ppo_atari.py", {"clip_coef": 0.05}),
     "ppo-eps0.2": ("ppo_atari.py", {"clip_coef": 0.2}),
 }
+ATARI_5 = ("BattleZone", "DoubleDunk", "NameThisGame", "Phoenix", "Qbert")
 COMMON_FLAGS = ["--eval-episodes", "0"]  # the measure is the thesis's, the last 100 games of training
 SCRIPTS = Path(__file__).resolve().parent.parent
-LOCK_SECONDS = 60  # for the process of a dead task to end: an iteration, and its checkpoint
+# For the process of a dead task to end, with its iteration and its checkpoint, or a file server to notice its node's
+# death (NFS: 90 s)
+LOCK_SECONDS = 120
+MOST_DEATHS = 10  # of the workers and nodes of one run; more, and it may be the run that kills them
+SILENCE_SECONDS = 300  # in which a running script has said something, as it does each minute
 PROGRESS = re.compile(r"step ([\d,]+) of [\d,]+, (\d+) SPS(?:, score (-?[\d.]+))?")  # what a script says each minute
 
 
 @dataclass
 class Args:
-    games: tuple[str, ...] = ("BattleZone", "DoubleDunk", "NameThisGame", "Phoenix", "Qbert")
+    games: tuple[str, ...] = ATARI_5
     """games, or whatever else the scripts take as `--env-id`; the default is Atari-5 (chapter 4)"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """seeds of each variant on each game; all games of one seed come before the next"""
@@ -71,7 +77,8 @@ class Args:
     cpus_per_run: int = 1
     """cores, and threads, of each run"""
     out: Path = Path(__file__).resolve().parent / "results"
-    """directory for everything that comes of the grid; with `--address`, on a path that all nodes share"""
+    """directory for everything that comes of the grid; with `--address`, on a path that all nodes share. The default
+    is for the thesis's games and length alone"""
     address: str | None = None
     """Ray cluster to run on, host:port or `auto` (the one this machine belongs to), not the cores of this process"""
     figures: bool = True
@@ -85,7 +92,7 @@ class Args:
             if not getattr(self, name):
                 refuse(f"--{name}", "give at least one")
         for game in self.games:
-            if not re.fullmatch(r"\w[\w./:-]*", game):
+            if not re.fullmatch(r"\w[\w./:-]{,100}", game):
                 refuse(f"--games {game!r}", "give names such as Phoenix, apart from each other")
         for variant in self.variants:
             if variant not in VARIANTS:
@@ -97,6 +104,12 @@ class Args:
                 refuse(f"--{name.replace('_', '-')} {given}", "give a whole number above 0")
         if self.address is None and self.cpus_per_run > available_cores():
             refuse(f"--cpus-per-run {self.cpus_per_run}", f"this process may use {available_cores()} cores")
+        for package in ("ray", "matplotlib", "pandas"):
+            if importlib.util.find_spec(package) is None:
+                refuse(package, "is not installed; pip install -e '.[benchmark]'")
+        thesis = (set(self.games) <= set(ATARI_5), self.total_timesteps == Args.total_timesteps)
+        if self.out == Args.out and thesis != (True, True):
+            refuse(f"--out {self.out}", "is for the thesis's games and length; give another directory")
         if self.address not in (None, "auto"):  # Ray itself would knock for minutes
             host, _, port = self.address.rpartition(":")
             try:
@@ -105,6 +118,7 @@ class Args:
                 refuse(f"--address {self.address}", "no Ray cluster answers there; give host:port, or auto")
 
 
+# These three are short forms of those in wrappers.py, whose import would take torch into every worker of Ray
 def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
@@ -183,11 +197,11 @@ class Run:
             self.state = "done"
 
 
-def tail(log: Path) -> str:
-    """Returns the last 4 kB of a log, or nothing where there is none yet."""
+def tail(log: Path, after: int = 0) -> str:
+    """Returns the last 4 kB of a log, of what is beyond `after` bytes; nothing where there is none yet."""
     try:
         with log.open("rb") as file:
-            file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
+            file.seek(max(after, file.seek(0, os.SEEK_END) - 4096))
             return file.read().decode(errors="replace")
     except OSError:
         return ""
@@ -265,16 +279,15 @@ def run_grid(runs: list[Run], args: Args) -> None:
     try:
         try:
             ray.init(args.address or "local", **quiet, **({} if args.address else cores))
-        except (ConnectionError, ValueError) as error:
-            refuse(f"--address {args.address}", f"Ray does not start there ({str(error).splitlines()[0]})")
+        except (ConnectionError, ValueError, RuntimeError) as error:
+            refuse(f"--address {args.address or 'local'}", f"Ray does not start there ({str(error).splitlines()[0]})")
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # after init, which sets the second
             if signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets the third
                 signal.signal(number, signal.default_int_handler)
         most = max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])
         if args.cpus_per_run > most:
             refuse(f"--cpus-per-run {args.cpus_per_run}", f"no node has more than {most:.0f}")
-        # -1: a node's death is no fault of the run's
-        task = ray.remote(train).options(num_cpus=args.cpus_per_run, max_retries=-1)
+        task = ray.remote(train).options(num_cpus=args.cpus_per_run, max_retries=MOST_DEATHS)
         omp = os.environ.get("OMP_NUM_THREADS")
         for run in runs:
             if run.state == "queued":
@@ -332,10 +345,12 @@ class Progress:
                 rows.append(f"{name}  failed")
             if run.state not in ("queued", "running"):
                 continue
-            step, score = run.step, ""
-            if (log := run.log(self.args)).exists() and log.stat().st_size > run.log_size:  # its task writes first
+            step, score, log = run.step, "", run.log(self.args)
+            written = tail(log, after=run.log_size)  # in this call; its task writes first
+            run.state = "queued"  # or so again, when its node has died
+            if written and time.time() - log.stat().st_mtime < SILENCE_SECONDS:
                 run.state = "running"
-                if said := PROGRESS.findall(tail(log)):
+                if said := PROGRESS.findall(written):
                     step, sps, score = said[-1]
                     step, speed = int(step.replace(",", "")), speed + int(sps)
                 rows.append(f"{name} {min(1, step / goal):5.0%}" + (f"  score {score}" if score else ""))
@@ -354,32 +369,32 @@ def main() -> None:
     grid = itertools.product(*map(dict.fromkeys, (args.seeds, args.games, args.variants)))  # each once
     runs = [Run(game, variant, seed) for seed, game, variant in grid]
     try:
-        for run in runs:
-            run.look(args)
+        try:
+            for run in runs:
+                run.look(args)
+            if not args.dry_run:
+                for directory in ("runs", "logs"):
+                    (args.out / directory).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            refuse(f"--out {args.out}", f"cannot be used ({error.strerror}); give another directory")
         if args.dry_run:
             for run in runs:
                 todo = f"from step {run.step:,}: {shlex.join(run.command(args))}"
                 print(f"{run.name}: {run.reason or ('finished' if run.state == 'done' else todo)}")
             sys.exit(any(run.state == "failed" for run in runs))
-        try:
-            for directory in ("runs", "logs"):
-                (args.out / directory).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            refuse(f"--out {args.out}", f"cannot be written ({error.strerror}); give another directory")
         if any(run.state == "queued" for run in runs):
             run_grid(runs, args)
+        failed = [run for run in runs if run.state == "failed"]
+        for run in failed:
+            say(f"{run.name}: {run.reason}")
+        say(f"{len(runs) - len(failed)} of {len(runs)} runs are done, in {args.out}")
+        if args.figures and len(failed) < len(runs):
+            figures = [sys.executable, str(Path(__file__).with_name("figures.py")), "--out", str(args.out)]
+            sys.exit(subprocess.run(figures).returncode != 0 or bool(failed))
+        sys.exit(bool(failed))
     except KeyboardInterrupt:
         say(f"Stopped; go on with the same command: {shlex.join([sys.executable, *sys.argv])}")
         sys.exit(130)
-    failed = [run for run in runs if run.state == "failed"]
-    for run in failed:
-        say(f"{run.name}: {run.reason}")
-    say(f"{len(runs) - len(failed)} of {len(runs)} runs are done, in {args.out}")
-    if failed:
-        sys.exit(1)
-    if args.figures:
-        figures = [sys.executable, str(Path(__file__).with_name("figures.py")), "--out", str(args.out)]
-        sys.exit(subprocess.run(figures).returncode != 0)
 
 
 if __name__ == "__main__":

@@ -168,6 +168,8 @@ def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path):
         ["--stop-at", "-5"],
         ["--cpus-per-run", "10000"],
         ["--out", "/proc/nothing"],
+        ["--out", "/dev/null"],
+        ["--games", "Q" * 300],
         ["--address", "127.0.0.1:1"],
         ["--address", "nonsense"],
     ],
@@ -180,6 +182,25 @@ def test_what_cannot_work_is_refused_in_one_line(flags, capsys, monkeypatch):
     assert ended.value.code == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and said.startswith(flags[0])
+
+
+@pytest.mark.parametrize(
+    "flags", [["--games", "Qbert", "Pong"], ["--total-timesteps", "20480"], ["--games", "Pong-v5"]]
+)
+def test_another_grid_than_the_thesis_s_takes_a_directory_of_its_own(flags, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["atari5.py", *flags])
+    with pytest.raises(SystemExit) as ended:
+        atari5.main()
+    said = capsys.readouterr().err
+    assert ended.value.code == 2 and said.startswith("--out ") and "the thesis's games and length" in said
+
+
+def test_a_missing_package_is_named_before_anything_runs(capsys, monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["atari5.py"])
+    monkeypatch.setattr(atari5.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit) as ended:
+        atari5.main()
+    assert (ended.value.code, capsys.readouterr().err) == (2, "ray: is not installed; pip install -e '.[benchmark]'\n")
 
 
 def test_an_interrupted_directory_without_a_checkpoint_does_not_count(tmp_path):
@@ -201,6 +222,13 @@ def test_the_table_shows_percent_score_and_time_left_from_the_logs(tmp_path):
     header, *rows = Progress(runs, args).table()
     assert header == "3 runs: 0 done, 1 running, 1 queued, 1 failed, 1:12:53 left"  # 1,749,120 steps at 400 a second
     assert [" ".join(row.split()) for row in rows] == ["Phoenix ppo seed 1 25% score -12.5", "Pong ppo seed 1 failed"]
+    os.utime(runs[0].log(args), (1, 1))  # its node has died
+    assert Progress(runs, args).table()[0] == "3 runs: 0 done, 0 running, 2 queued, 1 failed"
+    # What an earlier call has left in the log is not taken for this one's
+    runs[0].look(args)
+    with runs[0].log(args).open("a") as log:
+        log.write("$ python --resume\n")
+    assert " ".join(Progress(runs, args).table()[1].split()) == "Phoenix ppo seed 1 0%"
 
 
 # ------------------------------------------------------------------------------------ workers and nodes that are killed

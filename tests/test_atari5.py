@@ -1,5 +1,6 @@
 """The grid on real Ray: one command that is interrupted, called again, fails in part, and loses a node."""
 
+import fcntl
 import os
 import re
 import signal
@@ -131,6 +132,24 @@ def test_finished_runs_are_skipped_without_a_trace(grid):
     again = call(out, "--games", "CartPole-v1")
     assert (again.returncode, again.stderr) == (0, f"2 of 2 runs are done, in {out}\n")
     assert before == {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*")}
+
+
+def test_with_figures_the_same_command_ends_in_those_of_its_runs(grid):
+    out, _, _ = grid
+    again = call(out, "--games", "CartPole-v1", "--figures")
+    assert (again.returncode, again.stderr) == (0, f"2 of 2 runs are done, in {out}\n")
+    assert len(list((out / "figures").glob("*.png"))) == len(list((out / "figures").glob("*.svg"))) == 5
+    assert "2 runs (variants acppo, ppo; games CartPole-v1; seeds 1), at 100 %" in (out / "tables.md").read_text()
+
+
+def test_a_run_that_another_call_is_training_is_left_to_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(atari5, "LOCK_SECONDS", 0)
+    run, args = Run("CartPole-v1", "ppo", 1), Args(out=tmp_path)
+    (tmp_path / "logs").mkdir()
+    with run.log(args).open("ab") as log:
+        fcntl.flock(log, fcntl.LOCK_EX)
+        assert "another process is training it" in atari5.train(run, args, None)
+    assert run.log(args).read_text() == ""
 
 
 def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid):

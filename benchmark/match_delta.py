@@ -55,7 +55,7 @@ def interpolate(deltas: list[float], fractions: list[float], wanted: float) -> f
 
 def main(
     games: tuple[str, ...] = ("Phoenix", "Qbert"),
-    deltas: tuple[float, ...] = (0.04, 0.08, 0.16),
+    deltas: tuple[float, ...] = (0.02, 0.04, 0.08),
     seed: int = 1,
     iterations: int = 50,
     jobs: int = available_cores(),

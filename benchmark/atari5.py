@@ -215,6 +215,8 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
     The lock on the log keeps two processes off one run. It belongs to the open file, which the script inherits as its
     output: it lasts until the task and the script are gone, whichever of them lives longer.
     """
+    # Ray's cancel interrupts by this signal, which a worker ignores where the driver does, as under `nohup … &`
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     # Ray sets this for its workers; a run shall see what it would see without Ray
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
     if omp_num_threads is not None:

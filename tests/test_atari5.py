@@ -30,9 +30,9 @@ def call(out: Path, *flags: str) -> subprocess.CompletedProcess:
     return subprocess.run(grid_command(out, *flags), capture_output=True, text=True, timeout=300)
 
 
-def start(out: Path, *flags: str) -> subprocess.Popen:
+def start(out: Path, *flags: str, **given) -> subprocess.Popen:
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(grid_command(out, *flags), start_new_session=True, **pipes)
+    return subprocess.Popen(grid_command(out, *flags), start_new_session=True, **pipes, **given)
 
 
 def both_log(out: Path) -> bool:
@@ -163,6 +163,17 @@ def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid):
         wide.look(Args(out=out, total_timesteps=TOTAL))
         renamed.rename(run_dir)
         assert wide.state == "failed" and difference in wide.reason
+
+
+@pytest.mark.slow
+def test_a_grid_in_the_background_of_a_script_ends_on_sigterm(tmp_path):
+    """There, as after `nohup … &`, SIGINT is ignored by all that the shell starts."""
+    ignoring = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)}
+    driver = start(tmp_path, "--games", "CartPole-v1", "--total-timesteps", str(1000 * TOTAL), **ignoring)
+    wait_for(lambda: both_log(tmp_path))
+    driver.terminate()
+    assert driver.wait(timeout=60) == 130 and not processes(tmp_path)
+    assert all(steps(path)[-1] == global_step(path) > 0 for path in run_dirs(tmp_path).values())
 
 
 # ------------------------------------------------------------------------------------------------------- without Ray

@@ -41,7 +41,7 @@ VARIANTS = {
     "ppo": ("ppo_atari.py", {"clip_coef": 0.1}),  # the thesis's two, chapter 4
     "acppo": ("acppo_atari.py", {"clip_coef": 0.16, "c": 1.0}),
     "ppo-wide": ("ppo_atari.py", {"clip_coef": 0.16}),  # is it the adaptation, or the width?
-    "product": ("acppo_atari.py", {"clip_coef": 0.1, "c": math.inf}),  # only the product is bounded; δ not yet matched
+    "product": ("acppo_atari.py", {"clip_coef": 0.027, "c": math.inf}),  # the product alone; δ by match_delta.py
     "acppo-c0.25": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.25}),  # sensitivity to c ...
     "acppo-c0.5": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.5}),
     "acppo-c2": ("acppo_atari.py", {"clip_coef": 0.16, "c": 2.0}),

@@ -618,10 +618,10 @@ def draw_figure(name: str, caption: str, runs: pd.DataFrame, curves: Curves) -> 
         axis = next(axes)
         counts = {variant: len(seeds(curves, variant, game)) for variant in variants(curves)}
         counts = {variant: n for variant, n in counts.items() if n}
-        n = {f"n = {n}": variant for variant, n in counts.items()}
-        if len(n) > 1:
-            n = [f"{variant} n = {n}" for variant, n in counts.items()]
-        axis.set_title(f"{game} ({', '.join(n)})", fontsize="medium")
+        title_n = f" (n = {max(counts.values())})"
+        if len(set(counts.values())) > 1:
+            title_n = "\n(n = " + ", ".join(f"{n} {variant}" for variant, n in counts.items()) + ")"
+        axis.set_title(game + title_n, fontsize="small")
         draw_panel(axis, curves, game, column)
         lines = {"ppo": PPO_EPSILON} if name == "avg_clip_ratio" else {}
         if name == "tv_distance":

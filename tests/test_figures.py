@@ -418,7 +418,7 @@ def test_a_figure_says_game_seeds_units_and_bounds(tmp_path):
     }
     for name, figure in drawn.items():
         titles = [axis.get_title() for axis in figure.axes if axis.axison]
-        assert set(titles) == {"BattleZone (ppo n = 2, acppo n = 1)", "CartPole-v1 (n = 1)"}
+        assert set(titles) == {"BattleZone\n(n = 2 ppo, 1 acppo)", "CartPole-v1 (n = 1)"}
         assert {axis.get_xlabel() for axis in figure.axes[:2]} == {"emulator frames (4 a step)", "agent steps"}
         assert figure.axes[0].get_ylabel() == next(iter(figures.FIGURES[name][1].values()))
     # PPO's ε 0.1 in the clip ratio, ε / 2 of both variants in the TV distance

@@ -107,8 +107,8 @@ class Args:
         for package in ("ray", "matplotlib", "pandas"):
             if importlib.util.find_spec(package) is None:
                 refuse(package, "is not installed; pip install -e '.[benchmark]'")
-        thesis = (set(self.games) <= set(ATARI_5), self.total_timesteps == Args.total_timesteps)
-        if self.out == Args.out and thesis != (True, True):
+        another = not set(self.games) <= set(ATARI_5) or self.total_timesteps != Args.total_timesteps
+        if another and self.out == Args.out:
             refuse(f"--out {self.out}", "is for the thesis's games and length; give another directory")
         if self.address not in (None, "auto"):  # Ray itself would knock for minutes
             host, _, port = self.address.rpartition(":")

@@ -42,7 +42,6 @@ import sys
 import textwrap
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import matplotlib
 import numpy as np
@@ -56,7 +55,7 @@ from matplotlib.ticker import EngFormatter
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for wrappers.py, where nothing is installed
-from wrappers import FRAME_SKIP, find_atari_game
+from wrappers import FRAME_SKIP, find_atari_game, refuse
 
 ROOT = Path(__file__).resolve().parent.parent
 DEFAULT_OUT = ROOT / "benchmark" / "results"
@@ -127,11 +126,6 @@ class Args:
     readme: Path | None = None
     """file whose text between `<!-- results -->` and `<!-- end results -->` becomes the results; by default the
     project's README.md for the default grid, and none for another"""
-
-
-def refuse(given: object, advice: str) -> NoReturn:
-    print(f"{given}: {advice}", file=sys.stderr)
-    sys.exit(2)
 
 
 # ----------------------------------------------------------------------------------------------------- collect
@@ -243,9 +237,9 @@ def read_csvs(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
         except FileNotFoundError:
             table = pd.DataFrame({column: pd.Series(dtype=dtype) for column, dtype in types.items()})
         except (OSError, ValueError) as error:
-            refuse(out / name, f"cannot be read ({str(error).splitlines()[0]})")
+            refuse("out", out / name, f"cannot be read ({str(error).splitlines()[0]})")
         if list(table) != columns:
-            refuse(out / name, "has other columns than this script writes; move it away")
+            refuse("out", out / name, "has other columns than this script writes; move it away")
         tables.append(table)
     return tuple(tables)
 
@@ -582,10 +576,8 @@ def captions(runs: pd.DataFrame, curves: Curves) -> dict[str, str]:
     if runs.seed.nunique() > 1:
         band = "Line and band: mean ± sample standard deviation (ddof 1) over the n seeds that a panel's title gives, "
         band += "as far as all of a variant's have got; thin: each seed. Where n = 1 there is no band."
-    spikes = (
-        "Thin: every iteration of each seed. Thick: running median over a twentieth of them, then over a variant's "
-    )
-    spikes += "seeds, as far as all have got."
+    spikes = "Thin: every iteration of each seed. Thick: running median over a twentieth of them, then over a "
+    spikes += "variant's seeds, as far as all have got."
     kl = pd.concat([curve.kl for curve in curves.values()]).median()
     args = json.loads(runs.arguments.iloc[0])
     samples = args["num_envs"] * args["num_steps"]
@@ -688,20 +680,20 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     readme = args.readme or (ROOT / "README.md" if args.out.resolve() == DEFAULT_OUT else None)
     if args.readme and split_readme(args.readme) is None:
-        refuse(f"--readme {args.readme}", f"has no {MARKERS[0]} … {MARKERS[1]}, once, to write between")
+        refuse("readme", args.readme, f"has no {MARKERS[0]} … {MARKERS[1]}, once, to write between")
     try:
         if not (args.out / "runs").is_dir() and not (args.out / "curves.csv").exists():
-            refuse(f"--out {args.out}", "has neither runs nor their CSVs; run benchmark/atari5.py first")
+            refuse("out", args.out, "has neither runs nor their CSVs; run benchmark/atari5.py first")
         collect(args.out)
         if not all(map(len, read_csvs(args.out))):
-            refuse(f"--out {args.out}", "no run there has an iteration yet")
+            refuse("out", args.out, "no run there has an iteration yet")
         draw(args.out)
         if readme and (parts := split_readme(readme)):
             readme.write_text(f"{MARKERS[0]}\n{results_section(args.out, readme)}{MARKERS[1]}".join(parts))
         elif readme:
             print(f"{readme}: left as it is, it has no {MARKERS[0]} … {MARKERS[1]}", file=sys.stderr)
     except OSError as error:
-        refuse(error.filename or args.out, f"cannot be used ({error.strerror})")
+        refuse("out", args.out, f"cannot use {error.filename} ({error.strerror})")
     print(f"{args.out}: runs.csv, curves.csv, figures/, tables.md")
 
 

@@ -17,8 +17,9 @@ from benchmark import atari5
 from benchmark.atari5 import Args, Progress, Run
 from conftest import ROOT, scalars
 
-TOTAL = 20 * 1024  # agent steps: 20 rollouts, some seconds
-LONG = 3 * TOTAL
+# Agent steps of a run: many seconds, for two runs do not start at the same moment, and neither may end before both have
+# been interrupted
+TOTAL = 80 * 1024
 GRID = ["--variants", "ppo", "acppo", "--seeds", "1", "--total-timesteps", str(TOTAL), "--no-figures"]
 
 
@@ -154,8 +155,8 @@ def test_a_run_that_another_call_is_training_is_left_to_it(tmp_path, monkeypatch
 
 def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid):
     out, _, _ = grid
-    other = call(out, "--games", "CartPole-v1", "--total-timesteps", "40960", "--dry-run")
-    assert other.returncode == 1 and other.stdout.count("trained with --total-timesteps 20480, not with 40960") == 2
+    other = call(out, "--games", "CartPole-v1", "--total-timesteps", str(2 * TOTAL), "--dry-run")
+    assert other.returncode == 1 and other.stdout.count(f"--total-timesteps {TOTAL}, not with {2 * TOTAL}") == 2
     for variant, difference in (("ppo", "--clip-coef 0.1, not with 0.16"), ("acppo", "--c 1.0, not with None")):
         run_dir = run_dirs(out)[f"CartPole-v1__{variant}__1"]
         renamed = run_dir.rename(run_dir.with_name(run_dir.name.replace(variant, "ppo-wide")))
@@ -270,7 +271,7 @@ def finish(driver: subprocess.Popen, out: Path) -> list[str]:
     assert driver.returncode == 0, driver.communicate()
     runs = run_dirs(out)
     for run_dir in runs.values():
-        assert steps(run_dir) == list(range(1024, LONG + 1, 1024))
+        assert steps(run_dir) == list(range(1024, TOTAL + 1, 1024))
     return [name for name in runs if len(attempts(out, name)) == 2]
 
 
@@ -282,7 +283,7 @@ def resumed_at(run_dir: Path) -> int:
 
 @pytest.mark.slow
 def test_a_run_whose_worker_is_killed_writes_its_checkpoint_and_goes_on_from_there(tmp_path):
-    driver = start(tmp_path, "--games", "CartPole-v1", "--total-timesteps", str(LONG))
+    driver = start(tmp_path, "--games", "CartPole-v1", "--total-timesteps", str(TOTAL))
     wait_for(lambda: both_log(tmp_path))
     child = processes(tmp_path)["CartPole-v1__ppo__1"][0]
     worker = int(Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[1])
@@ -301,7 +302,7 @@ def test_a_killed_node_costs_time_and_nothing_else(tmp_path):
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         node = cluster.add_node(num_cpus=1)
-        flags = ("--games", "CartPole-v1", "--seeds", "1", "2", "--total-timesteps", str(LONG))
+        flags = ("--games", "CartPole-v1", "--seeds", "1", "2", "--total-timesteps", str(TOTAL))
         driver = start(tmp_path, *flags, "--address", cluster.address)
         wait_for(lambda: both_log(tmp_path))
         reached = {name: steps(path)[-1] for name, path in run_dirs(tmp_path).items()}

@@ -391,6 +391,12 @@ class RunDirectory:
         except (OSError, ValueError) as error:
             refuse(flag, path, getattr(error, "strerror", None) or error)
 
+    def close(self) -> None:
+        """Lets go of the event file and of the directory, as the end of the process would."""
+        if self.writer is not None:
+            self.writer.close()
+        os.close(self.lock)
+
     def describe(self, args, step: int) -> None:
         """Writes what the run is to `args.json`, and as text to TensorBoard, with the layout of its custom scalars."""
         about = {

@@ -1,14 +1,21 @@
-"""What several test files share: the scripts, names of tiny environments, and what a run has logged."""
+"""What several test files share: the scripts, in this process and in their own, and what a run has logged."""
 
+import contextlib
 import os
+import resource
 import signal
 import subprocess
 import sys
 import threading
+import time
+import warnings
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
@@ -17,19 +24,26 @@ from wrappers import make_envs
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {"ppo": ppo_atari, "acppo": acppo_atari}
-# For tests that start many processes: tests/test_siblings.py sees to it that what they test is the same in both
-ONE_IN_THE_PLAIN_RUN = [acppo_atari, pytest.param(ppo_atari, marks=pytest.mark.slow)]
 MEASURED_IN_SECONDS = ("charts/SPS", "time/")  # what two equal runs do not share
 TINY_PIXELS = "tiny_envs:TinyPixels-v0"
 SHORT_CARTPOLE = "tiny_envs:ShortCartPole-v0"
+SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
+PATIENCE = 600  # seconds that a process is waited for: they end a test that hangs, and decide nothing else
 
 
-@pytest.fixture(params=SCRIPTS.values(), ids=SCRIPTS)
+@pytest.fixture(params=[acppo_atari, pytest.param(ppo_atari, marks=pytest.mark.slow)], ids=["acppo", "ppo"])
 def script(request):
-    """Each of the two training scripts, as a module."""
+    """A training script: one in the plain suite, because tests/test_siblings.py holds the other to the same lines."""
     return request.param
 
 
+@pytest.fixture(params=SCRIPTS.values(), ids=SCRIPTS)
+def each_script(request):
+    """Both scripts in the plain suite too, for the mathematics and the smoke runs."""
+    return request.param
+
+
+# ------------------------------------------------------------------------------------------- what a run leaves behind
 def scalars(run_dir) -> dict[str, list[tuple[int, float]]]:
     """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points."""
     reader = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
@@ -41,37 +55,130 @@ def values(logged: dict, tag: str) -> np.ndarray:
     return np.array([value for _, value in logged[tag]])
 
 
+def reproducible(logged: dict) -> dict:
+    """What two equal runs log alike."""
+    return {tag: points for tag, points in logged.items() if not tag.startswith(MEASURED_IN_SECONDS)}
+
+
+def run_dir_in(directory: Path) -> Path:
+    """The one run's directory in a log directory."""
+    (run_dir,) = directory.iterdir()
+    return run_dir
+
+
+def checkpoint_of(run_dir: Path) -> dict:
+    return torch.load(run_dir / "checkpoint.pt", weights_only=True)
+
+
+# ------------------------------------------------------------------------------------------------------ in this process
+def open_run(script, path):
+    """Holds a run's directory for the body of a `with`."""
+    return contextlib.closing(script.RunDirectory(str(path)))
+
+
 def train(script, run_dir, **arguments) -> dict[str, list[tuple[int, float]]]:
-    """Trains in this process without the checks of the command line, and returns what was logged."""
+    """Trains without the checks of the command line, and returns what was logged."""
     args = script.Args(**{"threads": 1, **arguments})
     run_dir = Path(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
-    script.train(args, make_envs(args.env_id, args.num_envs, args.threads), script.RunDirectory(str(run_dir)))
+    with open_run(script, run_dir) as run:
+        script.train(args, make_envs(args.env_id, args.num_envs, args.threads), run)
     return scalars(run_dir)
 
 
-def run_script(script, *flags: str, cwd: Path) -> subprocess.CompletedProcess:
-    """Runs a script as a user would, in an empty directory, with the tests' environments importable."""
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests"), "COLUMNS": "200"}
-    command = [sys.executable, script.__file__, *flags]
-    return subprocess.run(command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=300)
+def flags_of(**arguments) -> list[str]:
+    return [word for name, value in arguments.items() for word in (f"--{name.replace('_', '-')}", str(value))]
+
+
+class Ended(NamedTuple):
+    """How a call of a script ended; `err` is without the line a minute that says how far the run is."""
+
+    status: int
+    out: str
+    err: str
+
+    @classmethod
+    def with_output(cls, status: int, out: str, err: str) -> "Ended":
+        lines = err.splitlines(keepends=True)
+        return cls(status, out, "".join(line for line in lines if not line.startswith("step ")))
 
 
 @pytest.fixture
-def call_main(monkeypatch, capfd):
-    """Calls a script's `main` in this process, for what ends before it trains: (exit status, stdout, stderr)."""
+def call_main(monkeypatch, capfd, tmp_path):
+    """Calls a script's `main` in this process, which stays as it was, from the test's own directory."""
+    monkeypatch.chdir(tmp_path)
 
-    def call(script, *flags: str) -> tuple[int, str, str]:
+    def call(script, *flags: str) -> Ended:
         monkeypatch.setattr(sys, "argv", [script.__file__, *flags])
         monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # which main replaces
         handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            script.main()
-            status = 0
-        except SystemExit as ended:
-            status = ended.code
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        return status, *capfd.readouterr()
+        opened, status = [], 0
+
+        class RunDirectory(script.RunDirectory):
+            def __init__(self, path: str):
+                super().__init__(path)
+                opened.append(self)
+
+        with monkeypatch.context() as patch, warnings.catch_warnings(record=True) as shown:
+            patch.setattr(script, "RunDirectory", RunDirectory)
+            warnings.resetwarnings()  # to those that a process of its own would print
+            for hidden in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
+                warnings.simplefilter("ignore", hidden)
+            try:
+                script.main()
+            except SystemExit as ended:
+                status = ended.code or 0
+            finally:
+                for run in opened:
+                    run.close()
+                for number, handler in handlers.items():
+                    signal.signal(number, handler)
+        out, err = capfd.readouterr()
+        return Ended.with_output(status, out, err + "".join(f"{warning.message}\n" for warning in shown))
 
     return call
+
+
+# -------------------------------------------------------------------------------------------------- as a process
+class Process(subprocess.Popen):
+    """A script as a user starts it, with the tests' environments importable."""
+
+    def __init__(self, script, *flags: str, cwd: Path, file_size: int | None = None):
+        """Starts it; no file that it writes can grow beyond `file_size` bytes, as if the disk were full."""
+        super().__init__(
+            [sys.executable, script.__file__, *flags],
+            cwd=cwd,
+            env={**os.environ, "PYTHONPATH": str(ROOT / "tests")},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            preexec_fn=file_size and partial(resource.setrlimit, resource.RLIMIT_FSIZE, (file_size, file_size)),
+        )
+
+    def wait_for(self, condition) -> None:
+        """Waits for something that the process does, which must not end without it."""
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert self.poll() is None, self.communicate()
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+
+    def end(self) -> Ended:
+        """Waits for its end."""
+        out, err = self.communicate(timeout=PATIENCE)
+        return Ended.with_output(self.returncode, out, err)
+
+
+@pytest.fixture
+def start(tmp_path):
+    """Starts a script as a process in the test's own directory; with the test, the process ends."""
+    started = []
+
+    def start_script(script, *flags: str, **limits) -> Process:
+        started.append(Process(script, *flags, cwd=tmp_path, **limits))
+        return started[-1]
+
+    yield start_script
+    for process in started:
+        process.kill()
+        process.communicate()

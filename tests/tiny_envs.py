@@ -1,5 +1,8 @@
 """Environments small enough for tests, registered when this module is imported."""
 
+import time
+from pathlib import Path
+
 import gymnasium as gym
 import numpy as np
 from gymnasium.spaces import Box, Discrete
@@ -47,21 +50,80 @@ class RenderedPixels(TinyPixels):
 
 
 class Endless(gym.Env):
-    """Nothing happens, for ever."""
+    """Nothing happens, for ever; step 100 of a game, which a short training does not reach, leaves a file behind."""
 
     observation_space = Box(0, 1, (2,), np.float32)
     action_space = Discrete(2)
 
     def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
         return np.zeros(2, np.float32), {}
 
     def step(self, action):
+        self.steps += 1
+        if self.steps == 100:
+            Path("step-100").touch()
         return np.zeros(2, np.float32), 0.0, False, False, {}
 
 
+class Stuck(Endless):
+    """Its first step takes an hour."""
+
+    def step(self, action):
+        Path("stuck").touch()
+        time.sleep(3600)
+        return super().step(action)
+
+
+class RewardNothing(gym.Env):
+    """Every step ends an episode with no reward, so that all returns are 0."""
+
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        return np.zeros(1, np.float32), 0.0, True, False, {}
+
+
+class CountsFromFive(gym.Env):
+    """Its actions are 5 and 6; anything else is an error."""
+
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2, start=5)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        assert action in self.action_space
+        return np.zeros(1, np.float32), float(action), False, False, {}
+
+
+class CannotStart(gym.Env):
+    """Fails when it is built, or when it is reset."""
+
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
+
+    def __init__(self, fails_in: str):
+        if fails_in == "init":
+            raise RuntimeError("no such\nlevel")
+
+    def reset(self, *, seed=None, options=None):
+        raise FileNotFoundError("level.txt")
+
+
+gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})
+gym.register("CannotBeReset-v0", CannotStart, kwargs={"fails_in": "reset"})
+gym.register("CountsFromFive-v0", CountsFromFive)
 gym.register("Endless-v0", Endless)
 gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
+gym.register("RewardNothing-v0", RewardNothing)
+gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)
+gym.register("Stuck-v0", Stuck)
 gym.register("TinyPixels-v0", TinyPixels, max_episode_steps=20)
 gym.register("TinyPixelsGrey-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": None})
 gym.register("TinyPixelsOneChannel-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": 1})
-gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)

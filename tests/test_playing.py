@@ -6,7 +6,6 @@ import os
 import resource
 import shlex
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -18,15 +17,24 @@ import torch
 from gymnasium.vector import VectorWrapper
 
 import tiny_envs
-from conftest import MEASURED_IN_SECONDS, ONE_IN_THE_PLAIN_RUN, ROOT, SHORT_CARTPOLE, TINY_PIXELS, run_script, scalars
+import wrappers
+from conftest import (
+    ROOT,
+    SHORT_CARTPOLE,
+    SMALL,
+    TINY_PIXELS,
+    checkpoint_of,
+    flags_of,
+    open_run,
+    reproducible,
+    run_dir_in,
+    scalars,
+    train,
+)
 from wrappers import RecordVideo, env_seeds, make_envs
 
-SMALL = ["--num-envs", "4", "--num-steps", "32", "--threads", "1"]
-
-
-@pytest.fixture(params=ONE_IN_THE_PLAIN_RUN, ids=["acppo", "ppo"])
-def script(request):
-    return request.param
+CARTPOLE = {"env_id": "CartPole-v1", **SMALL}
+RENDERED = "tiny_envs:RenderedPixels-v0"
 
 
 def agent_for(script, env_id: str):
@@ -82,27 +90,26 @@ def test_games_are_repeated_by_their_seed_and_leave_torchs_generator_alone(scrip
 @pytest.mark.parametrize(
     "env_id",
     [
-        "tiny_envs:RenderedPixels-v0",
+        RENDERED,
         pytest.param(SHORT_CARTPOLE, marks=pytest.mark.slow),
         pytest.param("Breakout", marks=pytest.mark.slow),
     ],
 )
-def test_training_is_the_same_with_and_without_videos_and_evaluation(script, env_id, tmp_path, monkeypatch):
+def test_training_is_the_same_with_and_without_videos_and_evaluation(script, env_id, tmp_path, monkeypatch, call_main):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # pygame complains without, where there is no desktop
-    flags = ["--env-id", env_id, "--total-timesteps", "512", *SMALL]
+    flags = flags_of(env_id=env_id, num_envs=2, num_steps=16, total_timesteps=128, update_epochs=1, threads=1)
     logged = []
     for name, extra in (("with", ["--capture-video", "--eval-episodes", "3"]), ("without", ["--eval-episodes", "0"])):
-        (tmp_path / name).mkdir()
-        run = run_script(script, *flags, *extra, cwd=tmp_path / name)
-        assert (run.returncode, run.stderr) == (0, "")
-        (run_dir,) = (tmp_path / name / "runs").iterdir()
+        ended = call_main(script, *flags, *extra, "--log-dir", name)
+        assert (ended.status, ended.err) == (0, "")
+        run_dir = run_dir_in(tmp_path / name)
         points = scalars(run_dir)
         assert ("eval/mean" in points) == (name == "with")
         assert (run_dir / "videos").exists() == (name == "with")
-        logged.append({tag: p for tag, p in points.items() if not tag.startswith((*MEASURED_IN_SECONDS, "eval/"))})
+        logged.append({tag: p for tag, p in reproducible(points).items() if not tag.startswith("eval/")})
     assert logged[0] == logged[1]
-    videos = [path.name.split("_")[1] for path in (tmp_path / "with").glob("runs/*/videos/*.webm")]
-    assert sorted(videos, key=int) == ["0", "128", "256", "384", "512"]  # the start, the quarters and the end
+    videos = [path.name.split("_")[1] for path in tmp_path.glob("with/*/videos/*.webm")]
+    assert sorted(videos, key=int) == ["0", "32", "64", "96", "128"]  # the start, the quarters and the end
 
 
 def test_a_video_of_atari_shows_the_game_that_the_agent_plays(script, tmp_path):
@@ -143,11 +150,10 @@ def test_a_video_of_atari_shows_the_game_that_the_agent_plays(script, tmp_path):
 
 
 def test_what_cannot_be_rendered_is_refused_before_a_run_begins(script, tmp_path, monkeypatch, call_main):
-    monkeypatch.chdir(tmp_path)
     status, _, said = call_main(script, "--env-id", TINY_PIXELS, "--capture-video")
     assert status == 2 and said.count("\n") == 1 and "it cannot be rendered" in said
     monkeypatch.setattr(tiny_envs.RenderedPixels, "render", lambda self: None)
-    status, _, said = call_main(script, "--env-id", "tiny_envs:RenderedPixels-v0", "--capture-video")
+    status, _, said = call_main(script, "--env-id", RENDERED, "--capture-video")
     assert status == 2 and said.count("\n") == 1 and "no video can be made of it" in said
     monkeypatch.setitem(sys.modules, "pygame", None)
     status, _, said = call_main(script, "--env-id", "CartPole-v1", "--capture-video")
@@ -155,12 +161,12 @@ def test_what_cannot_be_rendered_is_refused_before_a_run_begins(script, tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_checkpoint_is_evaluated_and_the_run_goes_on_after_it(script, tmp_path):
-    flags = ["--env-id", "CartPole-v1", "--total-timesteps", "512", "--stop-at", "256", *SMALL]
-    assert run_script(script, *flags, cwd=tmp_path).stdout == ""  # a run that stops on its way is not evaluated
-    (run_dir,) = (tmp_path / "runs").iterdir()
-    again = [run_script(script, "--evaluate", str(run_dir), "--eval-episodes", "5", cwd=tmp_path) for _ in range(2)]
-    assert [run.returncode for run in again] == [0, 0] and again[0].stdout == again[1].stdout
+def test_a_checkpoint_is_evaluated_and_the_run_goes_on_after_it(script, tmp_path, call_main):
+    stopped = call_main(script, *flags_of(**CARTPOLE, total_timesteps=512, stop_at=256))
+    assert stopped == (0, "", "")  # a run that stops on its way is not evaluated
+    run_dir = run_dir_in(tmp_path / "runs")
+    again = [call_main(script, "--evaluate", str(run_dir), "--eval-episodes", "5") for _ in range(2)]
+    assert again[0].status == 0 and again[0] == again[1]
     with open(run_dir / "eval.csv") as file:
         rows = list(csv.DictReader(file))
     assert [(int(row["step"]), int(row["game"])) for row in rows] == [(256, game) for game in (1, 2, 3, 4, 5)] * 2
@@ -169,37 +175,35 @@ def test_a_checkpoint_is_evaluated_and_the_run_goes_on_after_it(script, tmp_path
     logged = scalars(run_dir)
     for name, value in zip(("mean", "std", "median", "min", "max"), expected):
         assert logged[f"eval/{name}"] == [(256, pytest.approx(value))] * 2
-        assert f"{name} {value:.1f}" in again[0].stdout
-    resumed = run_script(script, "--resume", str(run_dir), cwd=tmp_path)
-    assert (resumed.returncode, resumed.stderr) == (0, "") and resumed.stdout.startswith("10 games at step 512:")
+        assert f"{name} {value:.1f}" in again[0].out
+    resumed = call_main(script, "--resume", str(run_dir))
+    assert (resumed.status, resumed.err) == (0, "") and resumed.out.startswith("10 games at step 512:")
     assert [step for step, _ in scalars(run_dir)["eval/mean"]] == [256, 256, 512]
 
 
-def test_a_killed_run_that_is_evaluated_is_still_rid_of_what_it_logged_after_its_checkpoint(script, tmp_path):
-    flags = ["--env-id", "CartPole-v1", "--total-timesteps", "1280", *SMALL]
-    assert run_script(script, *flags, "--stop-at", "256", cwd=tmp_path).returncode == 0
-    (run_dir,) = (tmp_path / "runs").iterdir()
+def test_a_killed_run_that_is_evaluated_is_still_rid_of_what_it_logged_after_its_checkpoint(
+    script, tmp_path, call_main
+):
+    call_main(script, *flags_of(**CARTPOLE, total_timesteps=1280, stop_at=256))
+    run_dir = run_dir_in(tmp_path / "runs")
     kept = (run_dir / "checkpoint.pt").read_bytes()
-    assert run_script(script, "--resume", str(run_dir), "--stop-at", "512", cwd=tmp_path).returncode == 0
+    call_main(script, "--resume", str(run_dir), "--stop-at", "512")
     (run_dir / "checkpoint.pt").write_bytes(kept)  # as if the process had been killed before its next checkpoint
-    assert run_script(script, "--evaluate", str(run_dir), "--eval-episodes", "2", cwd=tmp_path).returncode == 0
-    assert run_script(script, "--resume", str(run_dir), "--stop-at", "640", cwd=tmp_path).returncode == 0
+    assert call_main(script, "--evaluate", str(run_dir), "--eval-episodes", "2").status == 0
+    assert call_main(script, "--resume", str(run_dir), "--stop-at", "640") == (0, "", "")
     logged = scalars(run_dir)
     assert [step for step, _ in logged["charts/learning_rate"]] == [128, 256, 384, 512, 640]
     assert [step for step, _ in logged["eval/mean"]] == [256]
 
 
-def test_a_signal_ends_an_evaluation_at_once(script, tmp_path):
-    flags = ["--env-id", "tiny_envs:Endless-v0", "--total-timesteps", "128", *SMALL]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tests")}
-    process = subprocess.Popen([sys.executable, script.__file__, *flags], cwd=tmp_path, env=environment)
-    deadline = time.monotonic() + 120
-    while not any(torch.load(path)["iteration"] for path in tmp_path.glob("runs/*/checkpoint.pt")):
-        assert process.poll() is None and time.monotonic() < deadline
-        time.sleep(0.1)
-    time.sleep(2)  # its games, of 27,000 steps each, take longer
+def test_a_signal_ends_an_evaluation_at_once(script, tmp_path, start):
+    """A million games without an end are not waited for."""
+    flags = {"total_timesteps": 128, "eval_episodes": 1_000_000}
+    process = start(script, *flags_of(**{**CARTPOLE, "env_id": "tiny_envs:Endless-v0"}, **flags))
+    process.wait_for((tmp_path / "step-100").exists)  # of a game of the evaluation: the training has 32 steps a game
     process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=10) == -signal.SIGTERM
+    assert process.end() == (-signal.SIGTERM, "", "")
+    assert checkpoint_of(run_dir_in(tmp_path / "runs"))["global_step"] == 128
 
 
 def test_games_that_do_not_end_are_left_out(script, monkeypatch):
@@ -211,79 +215,75 @@ def test_games_that_do_not_end_are_left_out(script, monkeypatch):
     assert len(steps) == 27_000
 
 
+def recorded(script, run_dir, env_id: str) -> bool:
+    """Has a game recorded into a run's directory; returns whether all could be written."""
+    args = script.Args(env_id=env_id, threads=1)
+    with open_run(script, run_dir) as run:
+        script.record_game(args, agent_for(script, env_id), run, global_step=7)
+        return not run.failed
+
+
 def test_the_video_of_a_game_that_does_not_end_has_no_score(script, tmp_path, monkeypatch):
-    args = script.Args(env_id="tiny_envs:RenderedPixels-v0", log_dir=str(tmp_path), threads=1)
-    run = script.RunDirectory.make(args)
     monkeypatch.setattr(script, "play", lambda agent, envs, num_games, seed: envs.reset() and [])
-    script.record_game(args, agent_for(script, args.env_id), run, global_step=7)
-    assert [path.name for path in tmp_path.glob("*/videos/*")] == ["step_7_without_end.webm"] and not run.failed
+    assert recorded(script, tmp_path, RENDERED)
+    assert [path.name for path in tmp_path.glob("videos/*")] == ["step_7_without_end.webm"]
 
 
-@pytest.mark.slow
-def test_a_video_that_the_disk_has_no_room_for_is_reported(script, tmp_path):
-    flags = ["--env-id", "Breakout", "--total-timesteps", "128", *SMALL, "--capture-video", "--eval-episodes", "0"]
-    run = subprocess.run(
-        [sys.executable, script.__file__, *flags, "--checkpoint-minutes", "60"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (8_000, 8_000)),
-    )
-    assert run.returncode == 1 and run.stderr.count("\n") == 1 and "the run goes on" in run.stderr
-    assert not list(tmp_path.glob("runs/*/videos/*score*"))
+@pytest.mark.parametrize("env_id", [RENDERED, pytest.param("Breakout", marks=pytest.mark.slow)])
+def test_a_video_that_the_disk_has_no_room_for_is_reported(script, env_id, tmp_path, capfd):
+    """No file may grow beyond half a video's size, which is what the disk says when it is full."""
+    assert recorded(script, tmp_path, env_id)
+    (video,) = tmp_path.glob("videos/step_7_score_*.webm")
+    size = video.stat().st_size
+    video.unlink()
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size // 2, limits[1]))
+    try:
+        assert not recorded(script, tmp_path, env_id)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = capfd.readouterr().err
+    assert said.count("\n") == 1 and "the run goes on" in said
+    assert not list(tmp_path.glob("videos/*score*"))
 
 
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
         (["--evaluate", "nowhere"], "--evaluate nowhere: No such file or directory"),
-        (["--evaluate", "RUN", "--resume", "RUN"], "give either this or --resume"),
-        (["--evaluate", "RUN", "--eval-episodes", "0"], "give --eval-episodes above 0, too"),
+        (["--evaluate", "run", "--resume", "run"], "give either this or --resume"),
+        (["--evaluate", "run", "--eval-episodes", "0"], "give --eval-episodes above 0, too"),
         (["--eval-episodes", "-1"], "--eval-episodes -1: give a whole number from 0"),
     ],
 )
-def test_an_evaluation_that_cannot_be_is_refused(script, flags, said, tmp_path, monkeypatch, call_main):
-    monkeypatch.chdir(tmp_path)
-    args = script.Args(env_id="CartPole-v1", num_envs=2, num_steps=8, total_timesteps=16, threads=1)
-    run = script.RunDirectory.make(args)
-    script.train(args, make_envs("CartPole-v1", 2), run)
-    os.close(run.lock)
-    (run_dir,) = (tmp_path / "runs").iterdir()
-    status, _, err = call_main(script, *(str(run_dir) if flag == "RUN" else flag for flag in flags))
+def test_an_evaluation_that_cannot_be_is_refused(script, flags, said, tmp_path, call_main):
+    train(script, tmp_path / "run", env_id="CartPole-v1", num_envs=2, num_steps=8, total_timesteps=16)
+    status, _, err = call_main(script, *flags)
     assert status == 2 and err.count("\n") == 1 and said in err
 
 
-def test_the_run_directory_says_how_to_repeat_the_run(script, tmp_path):
+def test_the_run_directory_says_how_to_repeat_the_run(script, tmp_path, call_main):
     """Its command, run again, logs the same numbers."""
-    flags = ["--env-id", "CartPole-v1", "--total-timesteps", "256", "--no-norm-adv", "--gamma", "0.9", *SMALL]
-    run_script(script, *flags, cwd=tmp_path)
-    (run_dir,) = (tmp_path / "runs").iterdir()
+    call_main(script, *flags_of(**CARTPOLE, total_timesteps=256, gamma=0.9), "--no-norm-adv")
+    run_dir = run_dir_in(tmp_path / "runs")
     about = json.loads((run_dir / "args.json").read_text())
     assert about["started_at_step"] == 0
     assert about["args"]["gamma"] == 0.9 and about["args"]["norm_adv"] is False
-    assert about["provenance"]["torch"].startswith("2.13.0") and len(about["provenance"]["commit"]) >= 16
+    assert about["provenance"]["torch"] == torch.__version__ and len(about["provenance"]["commit"]) >= 16
     python, name, *words = shlex.split(about["command"])
     assert (python, ROOT / name) == ("python", Path(script.__file__))
-    again = run_script(script, *words, "--log-dir", "again", cwd=tmp_path)
-    assert again.returncode == 0
-    (repeated,) = (tmp_path / "again").iterdir()
-    first, second = (
-        {tag: points for tag, points in scalars(path).items() if not tag.startswith(MEASURED_IN_SECONDS)}
-        for path in (run_dir, repeated)
-    )
-    assert first == second
+    assert call_main(script, *words, "--log-dir", "again").status == 0
+    assert reproducible(scalars(run_dir)) == reproducible(scalars(run_dir_in(tmp_path / "again")))
 
 
 def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, tmp_path, monkeypatch, capfd):
-    import wrappers
-
     clock = [0.0]
-    monkeypatch.setattr(wrappers.time, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
     line = wrappers.StatusLine()
     for clock[0] in range(0, 200, 10):
         line.show(f"at {clock[0]}", last=False)
     assert capfd.readouterr().err == "at 60\nat 120\nat 180\n"
-    monkeypatch.setattr(wrappers.os, "isatty", lambda descriptor: True)
+    monkeypatch.setattr(os, "isatty", lambda descriptor: True)
     line.show("a", last=False)
     line.show("b", last=True)
     clear = "\r\x1b[K"

@@ -25,14 +25,14 @@ def brute_force_gae(rewards, values, next_values, terminations, truncations, gam
     return advantages
 
 
-def test_gae_matches_the_brute_force_sum(script):
+def test_gae_matches_the_brute_force_sum(each_script):
     random = np.random.default_rng(1)
     shape = (20, 6)
     rewards, values, next_values = random.normal(size=(3, *shape))
     terminations, truncations = random.random((2, *shape)) < 0.15
     assert terminations.any() and truncations.any()
     arrays = rewards, values, next_values, terminations, truncations
-    computed = script.compute_gae(*map(torch.from_numpy, arrays), gamma=0.9, gae_lambda=0.8)
+    computed = each_script.compute_gae(*map(torch.from_numpy, arrays), gamma=0.9, gae_lambda=0.8)
     assert np.allclose(computed, brute_force_gae(*arrays, gamma=0.9, gae_lambda=0.8), atol=1e-12)
 
 
@@ -42,16 +42,16 @@ def constant_rollout(reward: float, value: float, num_steps: int):
     return reward * full, value * full, value * full, never, never
 
 
-def test_gae_of_reward_one_and_value_zero_is_a_geometric_sum(script):
+def test_gae_of_reward_one_and_value_zero_is_a_geometric_sum(each_script):
     gamma, gae_lambda, num_steps = 0.99, 0.95, 50
-    advantages = script.compute_gae(*constant_rollout(1.0, 0.0, num_steps), gamma, gae_lambda)
+    advantages = each_script.compute_gae(*constant_rollout(1.0, 0.0, num_steps), gamma, gae_lambda)
     for steps_left in range(1, num_steps + 1):
         expected = (1 - (gamma * gae_lambda) ** steps_left) / (1 - gamma * gae_lambda)
         assert advantages[num_steps - steps_left].item() == pytest.approx(expected)
 
 
-def test_gae_of_the_true_value_is_zero(script):
-    advantages = script.compute_gae(*constant_rollout(1.0, 1 / (1 - 0.9), 50), 0.9, 0.95)
+def test_gae_of_the_true_value_is_zero(each_script):
+    advantages = each_script.compute_gae(*constant_rollout(1.0, 1 / (1 - 0.9), 50), 0.9, 0.95)
     assert advantages.abs().max() < 1e-12
 
 
@@ -117,32 +117,32 @@ def test_a_large_c_with_epsilon_c_delta_approaches_the_product_only_objective():
     assert torch.allclose(nearby, at_infinity, atol=1e-3)
 
 
-def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(script):
+def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(each_script):
     ratio = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.05])
     advantages = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0])
     clip = torch.full((5,), 0.1)
     expected = [1.1 * 2, 0.5 * 2, 1.5 * -2, 0.9 * -2, 1.05 * 2]
-    assert script.surrogate(ratio, advantages, clip).tolist() == pytest.approx(expected)
+    assert each_script.surrogate(ratio, advantages, clip).tolist() == pytest.approx(expected)
 
 
-def test_the_value_loss_is_half_the_squared_error_and_the_larger_of_two_when_clipped(script):
+def test_the_value_loss_is_half_the_squared_error_and_the_larger_of_two_when_clipped(each_script):
     new_values, values, returns = torch.tensor([1.0, 1.0]), torch.tensor([0.0, 0.0]), torch.tensor([3.0, 0.0])
-    assert script.value_loss(new_values, values, returns, None).item() == pytest.approx(0.5 * (4 + 1) / 2)
+    assert each_script.value_loss(new_values, values, returns, None).item() == pytest.approx(0.5 * (4 + 1) / 2)
     # Clipped to 0.1: errors 2.9² and 0.1², of which the larger with 2² and 1² counts
-    assert script.value_loss(new_values, values, returns, 0.1).item() == pytest.approx(0.5 * (2.9**2 + 1) / 2)
+    assert each_script.value_loss(new_values, values, returns, 0.1).item() == pytest.approx(0.5 * (2.9**2 + 1) / 2)
 
 
-def test_normalised_advantages_have_mean_zero_and_deviation_one(script):
-    normalised = script.normalize(torch.tensor([1.0, 2.0, 3.0, 6.0]))
+def test_normalised_advantages_have_mean_zero_and_deviation_one(each_script):
+    normalised = each_script.normalize(torch.tensor([1.0, 2.0, 3.0, 6.0]))
     assert normalised.mean().item() == pytest.approx(0, abs=1e-6)
     assert normalised.std().item() == pytest.approx(1)
 
 
-def test_the_change_of_the_policy_on_two_states_worked_out_by_hand(script):
+def test_the_change_of_the_policy_on_two_states_worked_out_by_hand(each_script):
     before = torch.tensor([[0.5, 0.5], [0.8, 0.2]], dtype=torch.float64)
     after = torch.tensor([[0.6, 0.4], [0.5, 0.5]], dtype=torch.float64)
     actions, advantages = torch.tensor([0, 1]), torch.tensor([2.0, -3.0], dtype=torch.float64)
-    change = script.policy_change(before.log(), after.log(), actions, advantages)
+    change = each_script.policy_change(before.log(), after.log(), actions, advantages)
     log = math.log
     kl_first = 0.5 * log(0.5 / 0.6) + 0.5 * log(0.5 / 0.4)
     kl_second = 0.8 * log(0.8 / 0.5) + 0.2 * log(0.2 / 0.5)

@@ -2,12 +2,10 @@
 
 import ale_py
 import cv2
-import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Discrete
 
-import tiny_envs  # noqa: F401  (registers its environments)
 from wrappers import atari_specs, env_seeds, find_atari_game, make_envs
 
 
@@ -64,11 +62,11 @@ class ReferenceGame:
 @pytest.mark.parametrize(
     ("rom", "num_steps", "expect"),
     [
-        ("breakout", 700, {"game", "life"}),  # lives and FIRE
-        ("pong", 1000, {"game"}),  # no lives
-        ("frogger", 700, {"game", "life", "waits at 0 lives"}),
-        ("double_dunk", 250, {"game", "truncation"}),  # no lives, and games too long to wait for their end
-        ("breakout", 300, {"game", "life", "truncation"}),
+        ("breakout", 260, {"game", "life"}),  # lives and FIRE
+        ("pong", 900, {"game"}),  # no lives
+        ("frogger", 350, {"game", "life", "waits at 0 lives"}),
+        ("double_dunk", 150, {"game", "truncation"}),  # no lives, and games too long to wait for their end
+        ("breakout", 150, {"game", "life", "truncation"}),
     ],
 )
 def test_games_match_a_frame_by_frame_reference(rom, num_steps, expect):
@@ -110,6 +108,7 @@ def test_games_match_a_frame_by_frame_reference(rom, num_steps, expect):
 
 
 def test_breakout_counts_five_lives_down_and_gives_one_score_a_game():
+    """With a policy that only says NOOP, which would stand still without FIRE."""
     envs = make_envs("Breakout", 1)
     _, infos = envs.reset(seed=env_seeds(1, 1))
     lives, life_ends, scores = [int(infos["lives"][0])], 0, []
@@ -125,16 +124,9 @@ def test_breakout_counts_five_lives_down_and_gives_one_score_a_game():
     assert len(scores) == 1
 
 
-def test_a_policy_that_only_says_noop_does_not_stall_in_breakout():
-    envs = make_envs("Breakout", 4)
-    envs.reset(seed=env_seeds(1, 4))
-    games = sum("episode" in envs.step(np.zeros(4, int))[-1] for _ in range(600))
-    assert games >= 4
-
-
 def test_a_game_starts_with_0_to_29_noops():
-    envs = make_envs("Breakout", 8)
-    frames = np.concatenate([envs.reset(seed=env_seeds(seed, 8))[1]["episode_frame_number"] for seed in range(15)])
+    """The seed is chosen: among its games are one with the fewest no-ops and one with the most that there can be."""
+    frames = make_envs("Breakout", 5).reset(seed=env_seeds(1, 5))[1]["episode_frame_number"]
     assert (frames.min(), frames.max()) == (0, 29)
 
 
@@ -142,13 +134,13 @@ def test_sticky_actions_are_played_in_the_ale_id_alone():
     """Without them two games from the same start that are played alike stay alike, whatever their random generators."""
 
     def screens(env_id: str) -> np.ndarray:
-        envs = make_envs(env_id, 8)
-        _, infos = envs.reset(seed=env_seeds(4, 8))
-        starts = infos["episode_frame_number"]
-        first, second = next((i, j) for i in range(8) for j in range(i) if starts[i] == starts[j])
+        envs = make_envs(env_id, 2)
+        _, infos = envs.reset(seed=env_seeds(0, 8)[3:5])  # chosen: two seeds with the same number of no-ops
+        first, second = infos["episode_frame_number"]
+        assert first == second
         for action in [1, 2, 2, 3, 3, 2, 3, 2, 2, 3] * 3:
-            obs = envs.step(np.full(8, action))[0]
-        return obs[first], obs[second]
+            obs = envs.step(np.full(2, action))[0]
+        return obs
 
     assert np.array_equal(*screens("Breakout"))
     assert not np.array_equal(*screens("ALE/Breakout-v5"))
@@ -194,9 +186,9 @@ def test_what_cannot_be_played_is_refused_by_name(env_id, message):
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize("env_id", ["tiny_envs:TinyPixels-v0", "TinyPixelsGrey-v0", "TinyPixelsOneChannel-v0"])
+@pytest.mark.parametrize("env_id", ["TinyPixels-v0", "TinyPixelsGrey-v0", "TinyPixelsOneChannel-v0"])
 def test_other_images_become_stacked_grey_screens(env_id):
-    envs = make_envs(env_id, 3)
+    envs = make_envs(f"tiny_envs:{env_id}", 3)
     obs, _ = envs.reset(seed=env_seeds(1, 3))
     assert obs.shape == (3, 4, 84, 84) and obs.dtype == np.uint8
     columns = [env.unwrapped.column for env in envs.unwrapped.envs]
@@ -216,43 +208,16 @@ def test_flat_observations_become_float32_and_rewards_stay():
     assert acrobot.step(np.array([0]))[1] == [-1.0]
 
 
-class CannotStart(gym.Env):
-    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
-
-    def __init__(self, fails_in: str):
-        self.fails_in = fails_in
-        if fails_in == "init":
-            raise RuntimeError("no such\nlevel")
-
-    def reset(self, *, seed=None, options=None):
-        raise FileNotFoundError("level.txt")
-
-
-@pytest.mark.parametrize(("fails_in", "message"), [("init", "no such\nlevel"), ("reset", "level.txt")])
-def test_an_environment_that_cannot_start_is_refused(fails_in, message):
-    gym.register("CannotStart-v0", CannotStart, kwargs={"fails_in": fails_in})
+@pytest.mark.parametrize(
+    ("env_id", "message"), [("CannotBeBuilt-v0", "no such\nlevel"), ("CannotBeReset-v0", "level.txt")]
+)
+def test_an_environment_that_cannot_start_is_refused(env_id, message):
     with pytest.raises(ValueError, match=f"it cannot be built: {message}"):
-        make_envs("CannotStart-v0", 2)
-    del gym.registry["CannotStart-v0"]
-
-
-class CountsFromFive(gym.Env):
-    """Its actions are 5 and 6; anything else is an error."""
-
-    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2, start=5)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        assert action in self.action_space
-        return np.zeros(1, np.float32), float(action), False, False, {}
+        make_envs(f"tiny_envs:{env_id}", 2)
 
 
 def test_actions_that_start_elsewhere_are_counted_from_zero():
-    gym.register("CountsFromFive-v0", CountsFromFive)
-    envs = make_envs("CountsFromFive-v0", 2)
+    envs = make_envs("tiny_envs:CountsFromFive-v0", 2)
     assert envs.single_action_space == Discrete(2)
     envs.reset(seed=[1, 2])
     assert list(envs.step(np.array([0, 1]))[1]) == [5.0, 6.0]

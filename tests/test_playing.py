@@ -206,7 +206,8 @@ def test_a_signal_ends_an_evaluation_at_once(script, tmp_path, start):
     assert checkpoint_of(run_dir_in(tmp_path / "runs"))["global_step"] == 128
 
 
-def test_games_that_do_not_end_are_left_out(script, monkeypatch):
+def test_games_that_do_not_end_are_left_out(script, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     envs = make_envs("tiny_envs:Endless-v0", 2)
     steps = []
     monkeypatch.setattr(script, "act", lambda agent, obs, generator: (steps.append(1) or torch.zeros(2).long(), 0, 0))

@@ -274,7 +274,7 @@ def test_a_second_signal_ends_at_once(script, tmp_path, start):
     """An agent step that takes an hour is not waited for."""
     process = start(script, *flags_of(**{**CARTPOLE, "env_id": "tiny_envs:Stuck-v0"}, **CANNOT_END))
     process.wait_for((tmp_path / "stuck").exists)
-    process.send_signal(signal.SIGTERM)
+    process.send_signal(signal.SIGINT)
     assert "once more" in process.stderr.readline()
     process.send_signal(signal.SIGTERM)
     assert process.end() == (-signal.SIGTERM, "", "")

@@ -166,6 +166,7 @@ def test_every_registered_game_is_found_by_its_bare_name():
     ("env_id", "message"),
     [
         ("Brekout", "did you mean Breakout"),
+        ("Break out", "did you mean Breakout"),
         ("CartPole-v9", "did you mean CartPole-v1"),
         ("combat", "no mode for one player"),
         ("MazeCraze", "no mode for one player"),

@@ -291,3 +291,15 @@ def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, tmp_pat
     monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it where the shell closed it: 2>&-
     line.show("c", last=True)
     assert capfd.readouterr().err == ""
+
+
+def test_an_evaluation_draws_its_actions_from_the_policy(script):
+    """Of a policy that takes action 1 three times in four, whatever it sees."""
+    agent, envs, actions = agent_for(script, "CartPole-v1"), make_envs("CartPole-v1", 4), []
+    with torch.no_grad():
+        agent.actor[-1].weight.zero_()
+        agent.actor[-1].bias.copy_(torch.tensor([1.0, 3.0]).log())
+    step = envs.step
+    envs.step = lambda given: actions.extend(given) or step(given)
+    script.play(agent, envs, 40, seed=[1, 1])
+    assert len(actions) > 300 and 0.65 < np.mean(actions) < 0.85

@@ -465,3 +465,16 @@ def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, m
     check()
     print(json.dumps({"trained": outcomes[0], "refused": outcomes[2], "not finite": outcomes[1]}))
     assert outcomes[0] > 60 and outcomes[2] > 60
+
+
+def test_a_resumed_run_plays_other_games_than_before(script, tmp_path):
+    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=128, **SMALL)
+    seeds = []
+    for _ in range(3):
+        envs = make_envs("CartPole-v1", 4)
+        reset = envs.reset
+        envs.reset = lambda *, seed, reset=reset: seeds.extend(seed) or reset(seed=seed)
+        run = script.RunDirectory(str(tmp_path))
+        script.train(args, envs, run, run.load(script.Args) if seeds else None)
+        os.close(run.lock)
+    assert len(set(seeds)) == len(seeds) == 12

@@ -292,8 +292,8 @@ FAULTS = [
     Fault(
         "an evaluation plays the likeliest actions",
         BOTH,
-        "        actions, _, _ = act(agent, from_envs(obs, device), generator)",
-        "        actions = act(agent, from_envs(obs, device), generator)[1].argmax(-1)",
+        "torch.multinomial(logprobs.exp(), 1, generator=generator).squeeze(-1), logprobs",
+        "(logprobs.argmax(-1) if generator else torch.multinomial(logprobs.exp(), 1).squeeze(-1)), logprobs",
         f"{PLAYING} -k 'games or share'",
     ),
     Fault(

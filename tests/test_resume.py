@@ -478,3 +478,20 @@ def test_a_resumed_run_plays_other_games_than_before(script, tmp_path):
         script.train(args, envs, run, run.load(script.Args) if seeds else None)
         os.close(run.lock)
     assert len(set(seeds)) == len(seeds) == 12
+
+
+def test_a_checkpoint_that_breaks_off_leaves_the_one_before_it(script, tmp_path, monkeypatch, capfd):
+    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=128, **SMALL)
+    run = script.RunDirectory(str(tmp_path))
+    script.train(args, make_envs("CartPole-v1", 4), run)
+    whole = (tmp_path / "checkpoint.pt").read_bytes()
+
+    def break_off(state, file):
+        file.write(whole[:1000])
+        assert (tmp_path / "checkpoint.pt").read_bytes() == whole  # a process that is killed now leaves it so
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", break_off)
+    run.save({**run.load(script.Args), "iteration": 2})
+    assert (tmp_path / "checkpoint.pt").read_bytes() == whole and run.failed
+    assert "No space left on device; the run goes on" in capfd.readouterr().err

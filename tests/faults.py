@@ -122,7 +122,7 @@ FAULTS = [
         BOTH,
         "mb_advantages = normalize(mb_advantages)",
         "mb_advantages = normalize(b_advantages)[mb_inds]",
-        TRAINING,
+        f"{TRAINING} -k within_each",
     ),
     Fault(
         "the loss rewards a policy without entropy",
@@ -145,7 +145,13 @@ FAULTS = [
 """,
         f"{TRAINING} -k norm_is_clipped",
     ),
-    Fault("gradients add up over minibatches", BOTH, "                optimizer.zero_grad()\n", "", TRAINING),
+    Fault(
+        "gradients add up over minibatches",
+        BOTH,
+        "                optimizer.zero_grad()\n",
+        "",
+        f"{TRAINING} -k own_minibatch",
+    ),
     Fault(
         "every epoch has the same minibatches",
         BOTH,
@@ -174,10 +180,14 @@ FAULTS = [
         "(1 - iteration / args.num_iterations)",
         f"{TRAINING} -k learning_rate",
     ),
-    Fault("Adam has torch's own eps", BOTH, "eps=1e-5, fused", "eps=1e-8, fused", TRAINING),
+    Fault("Adam has torch's own eps", BOTH, "eps=1e-5, fused", "eps=1e-8, fused", f"{TRAINING} -k own_minibatch"),
     # Rollout
     Fault(
-        "each rollout begins with the run's first observation", BOTH, "obs[0] = obs[T]", "obs[0] = first_obs", TRAINING
+        "each rollout begins with the run's first observation",
+        BOTH,
+        "obs[0] = obs[T]",
+        "obs[0] = first_obs",
+        f"{TRAINING} -k observation_before",
     ),
     # Log
     Fault(
@@ -221,7 +231,7 @@ FAULTS = [
         BOTH,
         "env_seeds(args.seed, N, starts)",
         "env_seeds(args.seed, N, 0)",
-        RESUME,
+        f"{RESUME} -k other_games",
     ),
     Fault(
         "Adam's moments are not taken from the checkpoint",
@@ -256,7 +266,7 @@ FAULTS = [
         WRAPPERS,
         """new = self.checkpoint + ".new\"""",
         "new = self.checkpoint",
-        f"{RESUME} -k 'full_disk or killed'",
+        f"{RESUME} -k breaks_off",
     ),
     Fault(
         "a number that is not finite is saved", BOTH, "        if broken:", "        if False:", f"{RESUME} -k finite"
@@ -294,7 +304,7 @@ FAULTS = [
         BOTH,
         "torch.multinomial(logprobs.exp(), 1, generator=generator).squeeze(-1), logprobs",
         "(logprobs.argmax(-1) if generator else torch.multinomial(logprobs.exp(), 1).squeeze(-1)), logprobs",
-        f"{PLAYING} -k 'games or share'",
+        f"{PLAYING} -k draws_its_actions",
     ),
     Fault(
         "an evaluation draws from the training's random numbers",
@@ -309,21 +319,21 @@ FAULTS = [
         GRID,
         "min(args.total_timesteps // rollout * rollout,",
         "min(args.total_timesteps,",
-        "tests/test_atari5.py -k 'skipped or directory'",
+        "tests/test_atari5.py -k whole_rollout",
     ),
     Fault(
         "the grid goes on with a run of other arguments",
         GRID,
         "if (has := trained.get(name)) != value:",
         "if (has := trained.get(name, value)) is None:",
-        "tests/test_atari5.py -k 'other_arguments or directory'",
+        "tests/test_atari5.py -k another_run",
     ),
     Fault(
         "runs of two seeds make a pair",
         FIGURES,
         "[(ppos[seed], acppos[seed]) for seed in sorted(ppos.keys() & acppos.keys())]",
         "list(zip(ppos.values(), acppos.values()))",
-        "tests/test_figures.py",
+        "tests/test_figures.py -k pair_has",
     ),
     Fault(
         "one script alone is changed",

@@ -316,3 +316,34 @@ def test_a_killed_node_costs_time_and_nothing_else(tmp_path):
     waited = max(int(path.name.split(".")[3]) for path in run_dir.glob("events.*")) - killed
     print(f"{again[0]} was at step {reached[again[0]]} when its node was killed.", end=" ")
     print(f"After {waited:.0f} s it went on from step {resumed_at(run_dir)} on the other node.")
+
+
+# ------------------------------------------------------------------------------------- what is taken for a run's own
+def look_at(out: Path, step: int, **trained) -> Run:
+    """Returns a run of ppo that has looked at a checkpoint of this step, trained with its arguments or others."""
+    args = {"clip_coef": 0.1, "env_id": "Qbert", "seed": 1, "total_timesteps": 10_000, "num_envs": 8, "num_steps": 128}
+    directory = out / "runs" / "Qbert__ppo__1__1700000000"
+    directory.mkdir(parents=True, exist_ok=True)
+    torch.save({"args": {**args, **trained}, "global_step": step}, directory / "checkpoint.pt")
+    run = Run("Qbert", "ppo", 1)
+    run.look(Args(out=out, total_timesteps=10_000))
+    return run
+
+
+def test_a_run_is_finished_at_the_last_whole_rollout_of_its_steps(tmp_path):
+    assert (look_at(tmp_path, 8192).state, look_at(tmp_path, 9216).state) == ("queued", "done")  # of 10,000
+
+
+@pytest.mark.parametrize(
+    ("trained", "said"),
+    [
+        ({"clip_coef": 0.16}, "--clip-coef 0.16, not with 0.1"),
+        ({"c": 1.0}, "--c 1.0, not with None"),
+        ({"env_id": "Pong"}, "--env-id Pong, not with Qbert"),
+        ({"seed": 2}, "--seed 2, not with 1"),
+        ({"total_timesteps": 20_000}, "--total-timesteps 20000, not with 10000"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_not_gone_on_with(trained, said, tmp_path):
+    run = look_at(tmp_path, 1024, **trained)
+    assert run.state == "failed" and said in run.reason

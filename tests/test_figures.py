@@ -427,3 +427,9 @@ def test_a_figure_says_game_seeds_units_and_bounds(tmp_path):
         for name in drawn
     }
     assert level["avg_clip_ratio"] == [0.1] and sorted(level["tv_distance"]) == [0.05, 0.08]
+
+
+def test_a_pair_has_one_seed_and_a_seed_without_a_partner_is_in_none(tmp_path):
+    runs = {("ppo", "Pong", seed): {"mean_return_100": [score]} for seed, score in ((1, 10), (2, 20), (3, 30))}
+    runs |= {("acppo", "Pong", seed): {"mean_return_100": [score]} for seed, score in ((2, 21), (3, 32), (4, 40))}
+    assert list(figures.find_margins(make_csvs(tmp_path, runs))["score"]["Pong"]) == [1, 2]

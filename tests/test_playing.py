@@ -306,3 +306,15 @@ def test_what_standard_error_cannot_take_does_not_end_the_run():
         os.dup2(kept, 2)
         os.close(kept)
         os.close(writer)
+
+
+def test_an_evaluation_draws_its_actions_from_the_policy(script):
+    """Of a policy that takes action 1 three times in four, whatever it sees."""
+    agent, envs, actions = agent_for(script, "CartPole-v1"), make_envs("CartPole-v1", 4), []
+    with torch.no_grad():
+        agent.actor[-1].weight.zero_()
+        agent.actor[-1].bias.copy_(torch.tensor([1.0, 3.0]).log())
+    step = envs.step
+    envs.step = lambda given: actions.extend(given) or step(given)
+    script.play(agent, envs, 40, seed=[1, 1])
+    assert len(actions) > 300 and 0.65 < np.mean(actions) < 0.85

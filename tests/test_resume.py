@@ -416,3 +416,32 @@ def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, m
     check()
     print(json.dumps({"trained": outcomes[0], "refused": outcomes[2], "not finite": outcomes[1]}))
     assert outcomes[0] > 60 and outcomes[2] > 60
+
+
+def test_a_resumed_run_plays_other_games_than_before(script, tmp_path):
+    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=128, **SMALL)
+    seeds = []
+    for _ in range(3):
+        envs = make_envs("CartPole-v1", 4)
+        reset = envs.reset
+        envs.reset = lambda *, seed, reset=reset: seeds.extend(seed) or reset(seed=seed)
+        with open_run(script, tmp_path) as run:
+            script.train(args, envs, run, run.load(script.Args) if seeds else None)
+    assert len(set(seeds)) == len(seeds) == 12
+
+
+def test_a_checkpoint_that_breaks_off_leaves_the_one_before_it(script, tmp_path, monkeypatch, capfd):
+    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=128, **SMALL)
+    run = script.RunDirectory(str(tmp_path))
+    script.train(args, make_envs("CartPole-v1", 4), run)
+    whole = (tmp_path / "checkpoint.pt").read_bytes()
+
+    def break_off(state, file):
+        file.write(whole[:1000])
+        assert (tmp_path / "checkpoint.pt").read_bytes() == whole  # a process that is killed now leaves it so
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(torch, "save", break_off)
+    run.save({**run.load(script.Args), "iteration": 2})
+    assert (tmp_path / "checkpoint.pt").read_bytes() == whole and run.failed
+    assert "No space left on device; the run goes on" in capfd.readouterr().err

@@ -290,3 +290,40 @@ def test_a_truncation_bootstraps_from_the_observation_it_ended_on(script, env_id
         with torch.inference_mode():
             expected = agent(torch.from_numpy(next_obs).movedim(1, -1))[1]
         assert torch.allclose(next_values[t], expected, atol=1e-5)
+
+
+def test_advantages_are_normalised_within_each_minibatch(script, tmp_path, monkeypatch):
+    objective = Recorder(monkeypatch, script, "surrogate")
+    train(script, tmp_path, **{**CARTPOLE, "total_timesteps": 128})
+    minibatches = torch.stack([given[1] for given, _ in objective.calls])
+    assert minibatches.shape == (16, 32)
+    assert minibatches.mean(1).abs().max() < 1e-5 and (minibatches.std(1) - 1).abs().max() < 1e-4
+
+
+def test_each_step_of_adam_follows_the_gradient_of_its_own_minibatch(script, tmp_path):
+    """At learning rate 0 all epochs have the same gradient; gradients that added up would grow from one to the next."""
+    seen = []
+
+    def keep(optimizer, *_):
+        gradients = [parameter.grad.flatten() for parameter in optimizer.param_groups[0]["params"]]
+        seen.append((torch.cat(gradients).norm().item(), optimizer.param_groups[0]["eps"]))
+
+    hook = register_optimizer_step_pre_hook(keep)
+    arguments = {**CARTPOLE, "total_timesteps": 128, "num_minibatches": 1, "update_epochs": 3}
+    train(script, tmp_path, learning_rate=0.0, max_grad_norm=1e9, **arguments)
+    hook.remove()
+    norms, epsilons = zip(*seen)
+    assert norms[0] > 0.01 and norms == pytest.approx([norms[0]] * 3, rel=1e-3)
+    assert epsilons == (1e-5,) * 3  # OpenAI's baselines' and CleanRL's; torch's own is 1e-8
+
+
+def test_every_action_is_chosen_on_the_observation_before_it(script, tmp_path, monkeypatch):
+    """The environments are played again with the recorded actions, across the border of two rollouts."""
+    rollout = Recorder(monkeypatch, script, "act")
+    train(script, tmp_path, **CARTPOLE)
+    envs = make_envs("CartPole-v1", 4)
+    obs, _ = envs.reset(seed=env_seeds(1, 4))
+    assert len(rollout.calls) == 64
+    for given, (actions, _, _) in rollout.calls:
+        assert np.array_equal(given[1], obs)
+        obs, *_ = envs.step(actions.numpy())

@@ -1,6 +1,4 @@
-"""What the two training scripts stand on: their environments, and the directory that a run is kept in.
-
-Environments: Atari, or any Gymnasium environment with discrete actions, as a vector environment.
+"""The environments of both scripts: Atari, or any Gymnasium environment with discrete actions, as a vector environment.
 
     envs = make_envs("Breakout", num_envs=8)
     next_obs, _ = envs.reset(seed=env_seeds(seed=1, num_envs=8))
@@ -9,36 +7,18 @@ Atari runs in ale-py's C++ threads under Gymnasium's own vector wrappers; `Episo
 neither has. Whatever else is registered with Gymnasium runs in a `SyncVectorEnv`. Both reset in the step that ends a
 game (`SAME_STEP`): with Gymnasium's default, `NEXT_STEP`, every game would be followed by a dummy transition that
 PPO then trains on.
-
-Run directory: `RunDirectory` holds a run's checkpoint, event files and `args.json`; `StopSignal` asks for a clean end.
-Of the algorithm, this file knows the curves in `LAYOUT` and the fields of a checkpoint (`load`).
 """
 
 import contextlib
-import csv
 import difflib
-import fcntl
-import importlib.metadata
-import inspect
-import itertools
-import json
 import os
-import platform
 import re
-import shlex
-import signal
-import subprocess
-import sys
-import time
-import typing
 import warnings
-import zipfile
 from collections.abc import Iterator, Sequence
 
 import ale_py
 import gymnasium as gym
 import numpy as np
-import torch
 from ale_py.vector_env import AtariVectorEnv
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Discrete
@@ -52,7 +32,6 @@ from gymnasium.wrappers import (
     TransformAction,
 )
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
-from torch.utils.tensorboard import SummaryWriter
 
 gym.register_envs(ale_py)
 
@@ -341,274 +320,3 @@ def preprocess(env: gym.Env) -> gym.Env:
         env = GrayscaleObservation(env) if shape[-1] == 3 else ReshapeObservation(env, shape[:2])
     env = ResizeObservation(env, SCREEN)  # before the stack: one screen is resized, not four
     return FrameStackObservation(env, STACK)
-
-
-# ------------------------------------------------------------------------------------------------ run directory
-OF_ONE_CALL = {"resume", "evaluate", "stop_at"}  # arguments that a run does not keep
-LAYOUT = {  # of TensorBoard's page "Custom Scalars"
-    "The thesis's figures": {
-        "score, mean of the last 100 games (4.1)": ["Multiline", ["charts/mean_return_100"]],
-        "KL between policy updates (4.2)": ["Multiline", ["losses/kl"]],
-        "average clip ratio (C.1)": ["Multiline", ["losses/avg_clip_ratio"]],
-        "clip fraction": ["Multiline", ["losses/clipfrac"]],
-    }
-}
-
-
-class RunDirectory:
-    """A run's event files and its checkpoint, held by one process at a time; a full disk costs points, not the run."""
-
-    def __init__(self, path: str):
-        """Opens an existing directory. Raises OSError; BlockingIOError where another process holds it."""
-        self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
-        self.lock = os.open(path, os.O_RDONLY)
-        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
-        self.writer = None
-        self.failed = False  # has anything not been written?
-        self.waiting = False  # for the next checkpoint to succeed, before more is logged?
-
-    @classmethod
-    def make(cls, args) -> "RunDirectory":
-        """Makes a new run's directory in `args.log_dir`; a name that is taken moves on to the next second."""
-        name = re.sub(r"[^\w.-]", "-", args.env_id)
-        try:
-            for second in itertools.count(int(time.time())):
-                path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
-                with contextlib.suppress(FileExistsError):
-                    os.makedirs(path)
-                    return cls(path)
-        except OSError as error:
-            refuse("log_dir", args.log_dir, f"cannot be written ({error.strerror}); give another directory")
-
-    @classmethod
-    def open(cls, path: str, flag: str, args_class: type) -> tuple["RunDirectory", dict]:
-        """Returns the run in a directory that was given as `flag`, and its checkpoint; see `load`."""
-        try:
-            run = cls(path)
-            return run, run.load(args_class)
-        except BlockingIOError:
-            refuse(flag, path, "another process holds it; wait for its end")
-        except (OSError, ValueError) as error:
-            refuse(flag, path, getattr(error, "strerror", None) or error)
-
-    def close(self) -> None:
-        """Lets go of the event file and of the directory, as the end of the process would."""
-        if self.writer is not None:
-            self.writer.close()
-        os.close(self.lock)
-
-    def describe(self, args, step: int) -> None:
-        """Writes what the run is to `args.json`, and as text to TensorBoard, with the layout of its custom scalars."""
-        about = {
-            "command": command_line(args),
-            "started_at_step": step,  # above 0 for a resumed run, which the command does not repeat
-            "args": saved_args(vars(args)),
-            "provenance": provenance(),
-        }
-        path = os.path.join(self.path, "args.json")
-        with self.reporting():
-            with open(path + ".new", "w") as file:
-                json.dump(about, file, indent=2)
-            os.replace(path + ".new", path)
-        with self.logging():
-            self.writer = SummaryWriter(self.path)
-            self.writer.add_custom_scalars(LAYOUT)
-            provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
-            for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
-                table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
-                self.writer.add_text(tag, "\n".join(table), step)
-            self.writer.flush()
-
-    def log(self, points: list[tuple]) -> None:
-        """Writes (tag, value, agent step) to TensorBoard."""
-        with self.logging():
-            if not self.waiting:
-                self.writer = self.writer or SummaryWriter(self.path)
-                for point in points:
-                    self.writer.add_scalar(*point)
-                self.writer.flush()
-
-    def log_games(self, games: list[tuple[float, int]], stats: dict[str, float], state: dict) -> None:
-        """Writes the games that the agent of checkpoint `state` has played to `eval.csv`, and `eval/…` statistics."""
-        before, step = self.event_files(), state["global_step"]
-        self.log([(f"eval/{name}", value, step) for name, value in stats.items()])
-        with self.reporting(), open(os.path.join(self.path, "eval.csv"), "a", newline="") as file:
-            rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
-            csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
-        # So that a resumed run keeps these points, and is still rid of others after the checkpoint
-        grown = {name: size for name, size in self.event_files().items() if size != before.get(name)}
-        self.save({**state, "event_files": {**state["event_files"], **grown}})
-
-    @contextlib.contextmanager
-    def logging(self) -> Iterator[None]:
-        """Reports what cannot be written to TensorBoard in its body; no more is until a checkpoint has been."""
-        try:
-            yield
-        except OSError as error:
-            self.writer, self.waiting = None, True  # its thread has died of it; there is a successor after a checkpoint
-            self.report(error)
-
-    @contextlib.contextmanager
-    def reporting(self) -> Iterator[None]:
-        """Reports what else cannot be written in its body."""
-        try:
-            yield
-        except OSError as error:
-            self.report(error)
-
-    def save(self, state: dict) -> None:
-        """Writes a checkpoint beside the last one and renames it over: at every instant one of the two is whole."""
-        new = self.checkpoint + ".new"
-        try:
-            with open(new, "wb") as file:
-                torch.save({"event_files": self.event_files(), **state, "args": saved_args(state["args"])}, file)
-            for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
-                with open(name, "rb+") as file:  # on the disk before the rename is, also if the power fails
-                    os.fsync(file.fileno())
-            os.replace(new, self.checkpoint)
-            os.fsync(self.lock)
-            self.waiting = False
-        except (OSError, RuntimeError) as error:  # torch raises the latter where the file raised the former
-            self.report(error)
-            with contextlib.suppress(OSError):
-                os.remove(new)  # half of it would fill the disk further
-
-    def report(self, error: Exception) -> None:
-        if not self.failed:
-            say(f"{self.path}: {error}; the run goes on, what cannot be written is lost")
-        self.failed = True
-
-    def load(self, args_class: type) -> dict:
-        """Returns the checkpoint. Raises ValueError where there is none, or none of a script with these arguments."""
-        if not os.path.exists(self.checkpoint):
-            raise ValueError("it holds no checkpoint; start the run anew")
-        try:
-            with zipfile.ZipFile(self.checkpoint) as archive:
-                whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
-            state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
-            args, hints = state["args"], typing.get_type_hints(args_class)
-            whole &= {type(state[name]) for name in ("iteration", "global_step", "starts")} == {int}
-            whole &= all(type(score) is float for score in state["last_scores"])
-            whole &= state["global_step"] == state["iteration"] * args["num_envs"] * args["num_steps"]
-            whole &= state["iteration"] >= 0 and 0 <= state["starts"] < 10**6
-            whole &= all(tensor.isfinite().all().item() for tensor in state["agent"].values())
-            others = args.keys() ^ (hints.keys() - OF_ONE_CALL)
-            whole &= all(isinstance(value, hints[name]) for name, value in args.items() if name not in others)
-        except Exception as error:  # whatever a file that is no checkpoint makes them raise
-            raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
-        if others:
-            raise ValueError(f"its checkpoint is of another script, which differs in {', '.join(sorted(others))}")
-        if not whole:
-            raise ValueError("its checkpoint is damaged")
-        return state
-
-    @contextlib.contextmanager
-    def loading(self, flag: str = "resume") -> Iterator[None]:
-        """Refuses a checkpoint whose parts its body cannot take, whatever one written by hand makes that raise."""
-        try:
-            yield
-        except Exception as error:
-            refuse(flag, self.path, f"its checkpoint does not fit this script ({type(error).__name__})")
-
-    def event_files(self) -> dict[str, int]:
-        """Returns the size in bytes of each event file, by name."""
-        return {file.name: file.stat().st_size for file in os.scandir(self.path) if file.name.startswith("events.")}
-
-    def cut_back(self, event_files: dict[str, int]) -> None:
-        """Takes out of the event files what was logged after the checkpoint, for every reader of them."""
-        for name, size in self.event_files().items():
-            os.truncate(os.path.join(self.path, name), min(size, event_files.get(name, 0)))
-
-
-class StopSignal:
-    """Notes the first SIGINT or SIGTERM in `number`, for a clean end; a second ends the process at once."""
-
-    number = 0
-
-    def listen(self, handler=None) -> None:
-        """From here on; `signal.SIG_DFL` gives the signals back to the system."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self.note if handler is None else handler)
-
-    def note(self, number: int, frame: object) -> None:
-        self.number = number
-        self.listen(signal.SIG_DFL)
-        say("Stopping after this iteration, with a checkpoint; once more ends at once")
-
-
-class StatusLine:
-    """One line that is written over in a terminal; a new line each minute where standard error goes to a file."""
-
-    def __init__(self):
-        self.due = time.perf_counter() + 60
-
-    def show(self, line: str, last: bool) -> None:
-        if os.isatty(2):
-            say(line, end="\n" if last else "")
-        elif time.perf_counter() >= self.due:
-            say(line)
-            self.due = time.perf_counter() + 60
-
-
-def say(text: str, end: str = "\n") -> None:
-    """Writes to standard error, whatever has become of it: the end of a pipe or a full disk must not end the run."""
-    start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
-    with contextlib.suppress(OSError):
-        if sys.stderr is not None:  # None: closed before Python started, and 2 may be a file of ours
-            os.write(2, (start + text + end).encode())
-
-
-def saved_args(args: dict[str, object]) -> dict[str, object]:
-    """Returns the arguments that belong to the run, not to one call of it."""
-    return {name: value for name, value in args.items() if name not in OF_ONE_CALL}
-
-
-def command_line(args) -> str:
-    """Returns the command that repeats the run: what is not the default, and what decides most in any case."""
-    words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], saved_args(vars(type(args)()))
-    for name, value in saved_args(vars(args)).items():
-        if value != defaults[name] or name in ("env_id", "seed", "threads"):
-            words.append(f"--{'no-' if value is False else ''}{name.replace('_', '-')}")
-            words += [] if isinstance(value, bool) else [str(value)]
-    return shlex.join(words)
-
-
-def provenance() -> dict[str, object]:
-    """Returns what a reader needs to repeat a run besides its arguments: versions, commit, machine, threads."""
-    packages = ["torch", "gymnasium", "ale-py", "numpy", "opencv-python-headless", "tensorboard", "tyro"]
-    git = ["git", "-C", os.path.dirname(os.path.abspath(__file__)), "describe", "--always", "--dirty", "--abbrev=40"]
-    try:  # --exclude: no tags, the commit itself
-        commit = subprocess.run([*git, "--exclude=*"], capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "not a git checkout"
-    versions = {package: importlib.metadata.version(package) for package in packages}
-    machine = f"{platform.platform()}, {available_cores()} cores, {torch.backends.cpu.get_cpu_capability()}"
-    threads = f"{torch.get_num_threads()} torch, OMP_WAIT_POLICY {os.environ.get('OMP_WAIT_POLICY', 'not set')}"
-    return {"commit": commit, "python": platform.python_version(), **versions, "machine": machine, "threads": threads}
-
-
-class Stopwatch:
-    """Adds up the seconds spent in each phase of an iteration (a GPU's work counts where it is waited for)."""
-
-    def __init__(self):
-        self.seconds: dict[str, float] = {}
-        self.last = time.perf_counter()
-
-    def lap(self, phase: str) -> None:
-        """Counts the time since the last lap as `phase`."""
-        now = time.perf_counter()
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self.last
-        self.last = now
-
-
-# ------------------------------------------------------------------------------------------------ command line
-def available_cores() -> int:
-    """Returns the number of cores this process may run on: its affinity, where the system has one."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def refuse(name: str, given: object, advice: object) -> typing.NoReturn:
-    """Ends the program with status 2 and one line: the flag, what was given to it, and what to do."""
-    line = f"--{name.replace('_', '-')} {given}: {advice}"
-    print(" ".join(line.split()), file=sys.stderr)  # one line, whatever an error's text has
-    sys.exit(2)

@@ -19,6 +19,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
+import bookkeeping
 import ppo_atari
 from wrappers import make_envs
 
@@ -114,13 +115,13 @@ def call_main(monkeypatch, capfd, tmp_path):
         handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         opened, status = [], 0
 
-        class RunDirectory(script.RunDirectory):
+        class RunDirectory(bookkeeping.RunDirectory):
             def __init__(self, path: str):
                 super().__init__(path)
                 opened.append(self)
 
         with monkeypatch.context() as patch, warnings.catch_warnings(record=True) as shown:
-            patch.setattr(script, "RunDirectory", RunDirectory)
+            patch.setattr(bookkeeping, "RunDirectory", RunDirectory)
             warnings.resetwarnings()  # to those that a process of its own would print
             for hidden in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
                 warnings.simplefilter("ignore", hidden)

@@ -16,8 +16,9 @@ import pytest
 import torch
 from gymnasium.vector import VectorWrapper
 
+import bookkeeping
 import tiny_envs
-import wrappers
+from bookkeeping import play, record_game
 from conftest import (
     ROOT,
     SHORT_CARTPOLE,
@@ -41,6 +42,10 @@ def agent_for(script, env_id: str):
     torch.manual_seed(1)
     envs = make_envs(env_id, 1)
     return script.Agent(envs.single_observation_space.shape, int(envs.single_action_space.n))
+
+
+def policy_for(script, env_id: str, seed: int = 1):
+    return script.make_policy(agent_for(script, env_id), seed)
 
 
 def screens_of(path: Path) -> list[np.ndarray]:
@@ -71,7 +76,7 @@ class LastsAsLongAsItsNumber(VectorWrapper):
 )
 def test_every_environment_plays_its_share_however_short_its_games(script, num_games, scores):
     envs = LastsAsLongAsItsNumber(make_envs("CartPole-v1", 4))
-    games = script.play(agent_for(script, "CartPole-v1"), envs, num_games, seed=[1, 1])
+    games = play(policy_for(script, "CartPole-v1"), envs, num_games, seed=[1, 1])
     assert [score for score, _ in games] == scores
     assert [length for _, length in games] == [2**score for score in scores]
 
@@ -80,7 +85,7 @@ def test_games_are_repeated_by_their_seed_and_leave_torchs_generator_alone(scrip
     agent = agent_for(script, "CartPole-v1")
     before = torch.get_rng_state()
     first, again, other = (
-        script.play(agent, make_envs("CartPole-v1", 3), 9, seed) for seed in ([1, 1], [1, 1], [2, 1])
+        play(script.make_policy(agent, seed), make_envs("CartPole-v1", 3), 9, [seed, 1]) for seed in (1, 1, 2)
     )
     assert first == again != other
     assert torch.equal(before, torch.get_rng_state())
@@ -134,7 +139,7 @@ def test_a_video_of_atari_shows_the_game_that_the_agent_plays(script, tmp_path):
         return result
 
     base.reset, base.step = watched_reset, watched_step
-    ((score, length),) = script.play(agent_for(script, "Breakout"), envs, 1, seed=[3, 2])
+    ((score, length),) = play(policy_for(script, "Breakout"), envs, 1, seed=[3, 2])
     envs.close()
     screens = screens_of(path)
     assert sum(raw_rewards) == score and len(raw_rewards) == length
@@ -206,13 +211,10 @@ def test_a_signal_ends_an_evaluation_at_once(script, tmp_path, start):
     assert checkpoint_of(run_dir_in(tmp_path / "runs"))["global_step"] == 128
 
 
-def test_games_that_do_not_end_are_left_out(script, tmp_path, monkeypatch):
+def test_games_that_do_not_end_are_left_out(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    envs = make_envs("tiny_envs:Endless-v0", 2)
     steps = []
-    monkeypatch.setattr(script, "act", lambda agent, obs, generator: (steps.append(1) or torch.zeros(2).long(), 0, 0))
-    agent = agent_for(script, "tiny_envs:Endless-v0")
-    assert script.play(agent, envs, 2, seed=[1, 1]) == []
+    assert play(lambda obs: steps.append(1) or np.zeros(2, int), make_envs("tiny_envs:Endless-v0", 2), 2, [1, 1]) == []
     assert len(steps) == 27_000
 
 
@@ -220,12 +222,12 @@ def recorded(script, run_dir, env_id: str) -> bool:
     """Has a game recorded into a run's directory; returns whether all could be written."""
     args = script.Args(env_id=env_id, threads=1)
     with open_run(script, run_dir) as run:
-        script.record_game(args, agent_for(script, env_id), run, global_step=7)
+        record_game(args, policy_for(script, env_id), run, step=7)
         return not run.failed
 
 
 def test_the_video_of_a_game_that_does_not_end_has_no_score(script, tmp_path, monkeypatch):
-    monkeypatch.setattr(script, "play", lambda agent, envs, num_games, seed: envs.reset() and [])
+    monkeypatch.setattr(bookkeeping, "play", lambda policy, envs, num_games, seed: envs.reset() and [])
     assert recorded(script, tmp_path, RENDERED)
     assert [path.name for path in tmp_path.glob("videos/*")] == ["step_7_without_end.webm"]
 
@@ -277,20 +279,26 @@ def test_the_run_directory_says_how_to_repeat_the_run(script, tmp_path, call_mai
     assert reproducible(scalars(run_dir)) == reproducible(scalars(run_dir_in(tmp_path / "again")))
 
 
-def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, tmp_path, monkeypatch, capfd):
+def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, monkeypatch, capfd):
     clock = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: clock[0])
-    line = wrappers.StatusLine()
+    args = script.Args(num_envs=10, num_steps=10, total_timesteps=2000)
+    line = bookkeeping.StatusLine()
     for clock[0] in range(0, 200, 10):
-        line.show(f"at {clock[0]}", last=False)
-    assert capfd.readouterr().err == "at 60\nat 120\nat 180\n"
+        line.show(args, clock[0] // 10, sps=50.0, last_scores=[1.0, 2.0])
+    assert capfd.readouterr().err == (
+        "step 600 of 2,000, 50 SPS, score 1.5, 0:00:28 left\n"
+        "step 1,200 of 2,000, 50 SPS, score 1.5, 0:00:16 left\n"
+        "step 1,800 of 2,000, 50 SPS, score 1.5, 0:00:04 left\n"
+    )
     monkeypatch.setattr(os, "isatty", lambda descriptor: True)
-    line.show("a", last=False)
-    line.show("b", last=True)
+    line.show(args, 19, sps=50.0, last_scores=[])
+    line.show(args, 20, sps=50.0, last_scores=[])
     clear = "\r\x1b[K"
-    assert capfd.readouterr().err == f"{clear}a{clear}b\n"
-    monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it where the shell closed it: 2>&-
-    line.show("c", last=True)
+    shown = f"{clear}step 1,900 of 2,000, 50 SPS, 0:00:02 left{clear}step 2,000 of 2,000, 50 SPS, 0:00:00 left\n"
+    assert capfd.readouterr().err == shown
+    monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it if the shell closed it: 2>&-
+    line.show(args, 20, sps=50.0, last_scores=[])
     assert capfd.readouterr().err == ""
 
 
@@ -301,7 +309,7 @@ def test_what_standard_error_cannot_take_does_not_end_the_run():
     kept = os.dup(2)
     try:
         os.dup2(writer, 2)
-        wrappers.say("to nobody")
+        bookkeeping.say("to nobody")
     finally:
         os.dup2(kept, 2)
         os.close(kept)
@@ -316,5 +324,5 @@ def test_an_evaluation_draws_its_actions_from_the_policy(script):
         agent.actor[-1].bias.copy_(torch.tensor([1.0, 3.0]).log())
     step = envs.step
     envs.step = lambda given: actions.extend(given) or step(given)
-    script.play(agent, envs, 40, seed=[1, 1])
+    play(script.make_policy(agent, 1), envs, 40, seed=[1, 1])
     assert len(actions) > 300 and 0.65 < np.mean(actions) < 0.85

@@ -77,7 +77,7 @@ def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     assert all(torch.equal(value, after["agent"][name]) for name, value in before["agent"].items())
     assert len(before["rng"]) == len(after["rng"]) and all(map(torch.equal, before["rng"], after["rng"]))
     assert before["last_scores"] == after["last_scores"] and len(before["last_scores"]) > 0
-    assert (before["starts"], after["starts"]) == (1, 2)
+    assert (before["num_starts"], after["num_starts"]) == (1, 2)
 
 
 def killed_and_resumed(script, tmp_path, start, call_main, kills: int) -> dict:
@@ -442,6 +442,6 @@ def test_a_checkpoint_that_breaks_off_leaves_the_one_before_it(script, tmp_path,
         raise OSError("No space left on device")
 
     monkeypatch.setattr(torch, "save", break_off)
-    run.save({**run.load(script.Args), "iteration": 2})
+    run.write({**run.load(script.Args), "iteration": 2})
     assert (tmp_path / "checkpoint.pt").read_bytes() == whole and run.failed
     assert "No space left on device; the run goes on" in capfd.readouterr().err

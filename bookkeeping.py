@@ -1,0 +1,563 @@
+"""What keeps a run: everything around the two algorithms that is not one.
+
+The scripts use four things of it. `open_run` decides what a call is to do and refuses what cannot work. `RunDirectory`
+holds a run's checkpoint, event files and `args.json`. `Stopwatch`, `StatusLine` and `StopSignal` accompany the loop.
+`finish` ends a call: it evaluates the agent, or says how to go on. Whole games are played by a policy that is passed in
+as a function, so that this file knows no network and no loss.
+
+`benchmark/` uses the small helpers at the top. They cost no torch: it is imported in the functions that need it.
+"""
+
+import contextlib
+import csv
+import ctypes
+import fcntl
+import importlib.metadata
+import inspect
+import itertools
+import json
+import math
+import os
+import platform
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import threading
+import time
+import typing
+import zipfile
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from datetime import timedelta
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from gymnasium.vector import VectorEnv
+
+from wrappers import env_seeds, make_envs
+
+Policy = Callable[[np.ndarray], np.ndarray]  # observations (N, …) → actions (N,)
+OF_ONE_CALL = {"resume", "evaluate", "stop_at"}  # arguments that a run does not keep
+RETIRED = {"compile"}  # arguments that older checkpoints have
+TENSORBOARD_LAYOUT = {  # of TensorBoard's page "Custom Scalars"
+    "The thesis's figures": {
+        "score, mean of the last 100 games (4.1)": ["Multiline", ["charts/mean_return_100"]],
+        "KL between policy updates (4.2)": ["Multiline", ["losses/kl"]],
+        "average clip ratio (C.1)": ["Multiline", ["losses/avg_clip_ratio"]],
+        "clip fraction": ["Multiline", ["losses/clipfrac"]],
+    }
+}
+
+
+# ------------------------------------------------------------------------------------------------ small helpers
+def available_cores() -> int:
+    """Returns the number of cores this process may run on: its affinity, if the system has one."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def say(text: str, end: str = "\n") -> None:
+    """Writes to standard error and ignores errors: a closed pipe or a full disk must not end a run."""
+    start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
+    with contextlib.suppress(OSError):
+        if sys.stderr is not None:  # None: closed before Python started, and 2 may be a file of ours
+            os.write(2, (start + text + end).encode())
+
+
+def refuse(given: str, advice: object) -> typing.NoReturn:
+    """Ends the program with status 2 and one line: what was given, and what to do."""
+    say(" ".join(f"{given}: {advice}".split()))
+    sys.exit(2)
+
+
+def flag(name: str, value: object) -> str:
+    """Returns an argument as it is given on the command line, for `refuse`."""
+    return f"--{name.replace('_', '-')} {value}"
+
+
+def write_text(path: str | os.PathLike, text: str) -> None:
+    """Replaces a file by UTF-8 text. It is written beside the file and renamed: one of the two is whole at any time."""
+    new = f"{os.fspath(path)}.new"
+    try:
+        with open(new, "w", encoding="utf-8", newline="\n") as file:
+            file.write(text)
+        os.replace(new, path)
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.remove(new)  # half of it would fill the disk further
+        raise
+
+
+def tune_process() -> None:
+    """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
+    # Idle OpenMP threads would spin on the cores that the games' threads need
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration: keeping
+    # them takes these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
+    if hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        libc.mallopt(-1, 1 << 30)
+        if not libc.mallopt(-3, 1 << 30):
+            libc.mallopt(-3, 1 << 25)  # the most that an older glibc takes
+
+
+# --------------------------------------------------------------------------------------------- bounds of arguments
+@dataclass(frozen=True)
+class Bounds:
+    """The values that an argument may have, beside its type."""
+
+    allow: Callable[[Any], bool]
+    advice: str
+
+
+def bounded(kind: type, allow: Callable[[Any], bool], metavar: str, advice: str) -> Any:
+    """Returns the type of a field of `Args` with bounds, which `--help` shows and `check` enforces."""
+    return Annotated[kind, Bounds(allow, f"give {advice}"), tyro.conf.arg(metavar=metavar)]
+
+
+# Below 1e30, because float32 must hold what is computed with it
+PositiveInt = bounded(int, lambda x: 0 < x <= 10**12, "1..10^12", "a whole number from 1 to 10^12")
+NonNegativeInt = bounded(int, lambda x: 0 <= x < 2**64, "0..2^64-1", "a whole number from 0 to 2^64 - 1")
+PositiveFloat = bounded(float, lambda x: 0 < x < 1e30, ">0", "a number above 0 and below 1e30")
+NonNegativeFloat = bounded(float, lambda x: 0 <= x < 1e30, ">=0", "a number from 0 to below 1e30")
+NonNegativeOrInf = bounded(
+    float, lambda x: 0 <= x < 1e30 or x == math.inf, ">=0|inf", "a number from 0 to below 1e30, or inf"
+)
+Fraction = bounded(float, lambda x: 0 <= x <= 1, "0..1", "a number from 0 to 1")
+MOST_THREADS = 4 * available_cores()
+Threads = bounded(int, lambda x: 0 < x <= MOST_THREADS, f"1..{MOST_THREADS}", f"a number from 1 to {MOST_THREADS}")
+FileName = bounded(
+    str, lambda x: re.fullmatch(r"[\w.-]{1,100}", x), "NAME", "up to 100 letters, digits, '.', '_' and '-'"
+)
+
+
+def check(args) -> None:
+    """Refuses the first argument that is out of its bounds or breaks one of `args.rules()`."""
+    for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
+        value = getattr(args, name)
+        for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # `X | None` has X among its args
+            for bounds in getattr(kind, "__metadata__", ()):
+                if isinstance(bounds, Bounds) and not bounds.allow(value):
+                    refuse(flag(name, value), bounds.advice)
+    for name, holds, advice in args.rules():
+        if not holds:
+            refuse(flag(name, getattr(args, name)), advice)
+
+
+# ------------------------------------------------------------------------------------------------ run directory
+class RunDirectory:
+    """A run's checkpoint and event files, held by one process at a time. A full disk costs points, not the run."""
+
+    def __init__(self, path: str):
+        """Opens an existing directory. Raises OSError; BlockingIOError if another process holds it."""
+        self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
+        self.lock = os.open(path, os.O_RDONLY)
+        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
+        self.writer = None
+        self.failed = False  # could something not be written?
+        self.waiting = False  # for the next checkpoint to succeed, before more is logged
+        self.num_starts = 0  # each start of a run plays games of its own
+        self.last_scores = deque(maxlen=100)  # raw returns of whole games
+        self.checkpoint_due = 0.0
+
+    @classmethod
+    def make(cls, args) -> "RunDirectory":
+        """Makes a new run's directory in `args.log_dir`. If its name is taken, it gets that of the next second."""
+        name = re.sub(r"[^\w.-]", "-", args.env_id)
+        try:
+            for second in itertools.count(int(time.time())):
+                path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
+                with contextlib.suppress(FileExistsError):
+                    os.makedirs(path)
+                    return cls(path)
+        except OSError as error:
+            refuse(flag("log_dir", args.log_dir), f"cannot be written ({error.strerror}); give another directory")
+
+    @classmethod
+    def open(cls, path: str, name: str, args_class: type) -> tuple["RunDirectory", dict]:
+        """Returns the run in a directory that was given as the argument `name`, and its checkpoint; see `load`."""
+        try:
+            run = cls(path)
+            return run, run.load(args_class)
+        except BlockingIOError:
+            refuse(flag(name, path), "another process holds it; wait for its end")
+        except (OSError, ValueError) as error:
+            refuse(flag(name, path), getattr(error, "strerror", None) or error)
+
+    def close(self) -> None:
+        """Lets go of the directory, for another process or object to open it."""
+        if self.writer is not None:
+            self.writer.close()
+        os.close(self.lock)
+
+    def load(self, args_class: type) -> dict:
+        """Returns the checkpoint. Raises ValueError if there is none, or none of a script with these arguments."""
+        import torch
+
+        if not os.path.exists(self.checkpoint):
+            raise ValueError("it holds no checkpoint; start the run anew")
+        try:
+            with zipfile.ZipFile(self.checkpoint) as archive:
+                whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
+            state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+            state["num_starts"] = state.get("num_starts", state.get("starts"))  # as it was called before
+            state["args"] = {name: value for name, value in state["args"].items() if name not in RETIRED}
+            others = state["args"].keys() ^ (args_class.__dataclass_fields__.keys() - OF_ONE_CALL)
+            whole &= all(tensor.isfinite().all().item() for tensor in state["agent"].values())
+            rollout = state["args"]["num_envs"] * state["args"]["num_steps"]
+            whole &= state["global_step"] == state["iteration"] * rollout
+        except Exception as error:  # a file that is no checkpoint can make them raise anything
+            raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
+        if others:
+            raise ValueError(f"its checkpoint is of another script, which differs in {', '.join(sorted(others))}")
+        if not whole:
+            raise ValueError("its checkpoint is damaged")
+        return state
+
+    def start(self, args, state: dict | None, agent, optimizer=None) -> int:
+        """Starts afresh, or restores the checkpoint `state` into `agent` and `optimizer`; returns the iterations done.
+
+        The emulators' state is not saved, so a resumed run starts new games. What was logged after the checkpoint is
+        cut from the event files, for every reader of them.
+        """
+        import torch
+
+        done = 0
+        if state is not None:
+            try:
+                agent.load_state_dict(state["agent"])
+                if optimizer is None:  # for playing alone
+                    return state["iteration"]
+                optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
+                torch.set_rng_state(state["rng"][0])
+                if torch.cuda.is_available() and len(state["rng"]) > 1:
+                    torch.cuda.set_rng_state(state["rng"][1])
+                done, self.num_starts = state["iteration"], state["num_starts"]
+                self.last_scores.extend(state["last_scores"])
+                for name, size in self.event_files().items():
+                    os.truncate(os.path.join(self.path, name), min(size, state["event_files"].get(name, 0)))
+            except Exception as error:  # parts of another network can make them raise anything
+                name = "evaluate" if optimizer is None else "resume"
+                refuse(flag(name, self.path), f"its checkpoint does not fit this script ({type(error).__name__})")
+        self.describe(args, done * args.batch_size)
+        return done
+
+    def describe(self, args, step: int) -> None:
+        """Writes the run's arguments and provenance to `args.json` and TensorBoard, and the layout of its page."""
+        about = {
+            "command": command_line(args),
+            "started_at_step": step,  # above 0 for a resumed run, which the command does not repeat
+            "args": saved_args(args),
+            "provenance": provenance(),
+        }
+        with self.reporting():
+            write_text(os.path.join(self.path, "args.json"), json.dumps(about, indent=2))
+        with self.logging():
+            self.event_writer().add_custom_scalars(TENSORBOARD_LAYOUT)
+            provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
+            for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
+                table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
+                self.writer.add_text(tag, "\n".join(table), step)
+            self.writer.flush()
+
+    def log(self, step: int, scalars: dict[str, float], games: list[tuple[int, float, int]] = ()) -> None:
+        """Writes scalars at an agent step, and games as (agent step, score, length) at the steps where they ended."""
+        points = []
+        for end, score, length in games:
+            self.last_scores.append(score)
+            points += [("charts/episodic_return", score, end), ("charts/episodic_length", length, end)]
+        if self.last_scores:
+            points.append(("charts/mean_return_100", np.mean(self.last_scores), step))
+        self.log_points([*points, *((tag, value, step) for tag, value in scalars.items())])
+
+    def log_points(self, points: list[tuple[str, float, int]]) -> None:
+        """Writes (tag, value, agent step) to TensorBoard."""
+        with self.logging():
+            if not self.waiting:
+                for point in points:
+                    self.event_writer().add_scalar(*point)
+                self.event_writer().flush()
+
+    def event_writer(self):
+        from torch.utils.tensorboard import SummaryWriter
+
+        self.writer = self.writer or SummaryWriter(self.path)
+        return self.writer
+
+    def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], state: dict) -> None:
+        """Writes the games that the agent of checkpoint `state` has played to `eval.csv`, and their statistics."""
+        before, step = self.event_files(), state["global_step"]
+        self.log_points([(f"eval/{name}", value, step) for name, value in stats.items()])
+        path = os.path.join(self.path, "eval.csv")
+        with self.reporting(), open(path, "a", newline="", encoding="utf-8") as file:
+            rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
+            csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
+        # So that a resumed run keeps these points, and is still rid of others after the checkpoint
+        grown = {name: size for name, size in self.event_files().items() if size != before.get(name)}
+        self.write({**state, "event_files": {**state["event_files"], **grown}})
+
+    def save(self, args, iteration: int, agent, optimizer) -> None:
+        """Writes a checkpoint, and sets the time at which the next is due."""
+        import torch
+
+        rng = [torch.get_rng_state()]
+        if next(agent.parameters()).is_cuda:
+            rng.append(torch.cuda.get_rng_state())
+        progress = {"iteration": iteration, "global_step": iteration * args.batch_size}
+        progress |= {"num_starts": self.num_starts + 1, "last_scores": list(self.last_scores)}
+        learner = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"], "rng": rng}
+        self.write({"event_files": self.event_files(), "args": saved_args(args), **progress, **learner})
+        self.checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
+
+    def is_checkpoint_due(self) -> bool:
+        return time.perf_counter() >= self.checkpoint_due
+
+    def write(self, state: dict) -> None:
+        """Writes a checkpoint beside the last one and renames it over: at every instant one of the two is whole."""
+        import torch
+
+        new = self.checkpoint + ".new"
+        try:
+            with open(new, "wb") as file:
+                torch.save(state, file)
+            for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
+                with open(name, "rb+") as file:  # on the disk before the rename is, even if the power fails
+                    os.fsync(file.fileno())
+            os.replace(new, self.checkpoint)
+            os.fsync(self.lock)
+            self.waiting = False
+        except (OSError, RuntimeError) as error:  # torch raises the latter for the former
+            self.report(error)
+            with contextlib.suppress(OSError):
+                os.remove(new)
+
+    @contextlib.contextmanager
+    def logging(self) -> Iterator[None]:
+        """Reports what cannot be written to TensorBoard in its body; no more is until a checkpoint has been."""
+        try:
+            yield
+        except OSError as error:
+            self.writer, self.waiting = None, True  # its thread has died of it; a checkpoint is followed by a new one
+            self.report(error)
+
+    @contextlib.contextmanager
+    def reporting(self) -> Iterator[None]:
+        """Reports what cannot be written in its body."""
+        try:
+            yield
+        except OSError as error:
+            self.report(error)
+
+    def report(self, error: Exception) -> None:
+        if not self.failed:
+            say(f"{self.path}: {error}; the run goes on, what cannot be written is lost")
+        self.failed = True
+
+    def event_files(self) -> dict[str, int]:
+        """Returns the size in bytes of each event file, by name."""
+        return {file.name: file.stat().st_size for file in os.scandir(self.path) if file.name.startswith("events.")}
+
+
+# ---------------------------------------------------------------------------------------------- beside the loop
+class StopSignal:
+    """Notes the first SIGINT or SIGTERM in `number`, for a clean end; a second ends the process at once."""
+
+    number = 0
+
+    def listen(self, handler=None) -> None:
+        """From here on; `signal.SIG_DFL` gives the signals back to the system."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self.note if handler is None else handler)
+
+    def note(self, number: int, frame: object) -> None:
+        self.number = number
+        self.listen(signal.SIG_DFL)
+        say("Stopping after this iteration, with a checkpoint; once more ends at once")
+
+
+class Stopwatch:
+    """Measures the phases of an iteration, and the speed over the last ten (a GPU's work counts when it is awaited)."""
+
+    def __init__(self):
+        self.seconds: dict[str, float] = {}
+        self.last = time.perf_counter()
+        self.iteration_ends = deque([self.last], maxlen=11)
+
+    def lap(self, phase: str) -> None:
+        """Counts the time since the last lap as `phase`."""
+        now = time.perf_counter()
+        self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self.last
+        self.last = now
+
+    def read(self, batch_size: int) -> dict[str, float]:
+        """Ends an iteration of `batch_size` agent steps: returns its tags. What follows counts in the next one."""
+        self.lap("rest")
+        self.iteration_ends.append(self.last)
+        sps = (len(self.iteration_ends) - 1) * batch_size / (self.iteration_ends[-1] - self.iteration_ends[0])
+        tags = {"charts/SPS": sps, **{f"time/{phase}": seconds for phase, seconds in self.seconds.items()}}
+        self.seconds = {}
+        return tags
+
+
+class StatusLine:
+    """One line that is written over in a terminal; a new line each minute if standard error goes to a file."""
+
+    def __init__(self):
+        self.due = time.perf_counter() + 60
+
+    def show(self, args, iteration: int, sps: float, last_scores: deque) -> None:
+        left = timedelta(seconds=int((args.last_iteration - iteration) * args.batch_size / sps))
+        score = f", score {np.mean(last_scores):.1f}" if last_scores else ""
+        step, last_step = iteration * args.batch_size, args.last_iteration * args.batch_size
+        line = f"step {step:,} of {last_step:,}, {sps:.0f} SPS{score}, {left} left"
+        if os.isatty(2):
+            say(line, end="\n" if iteration == args.last_iteration else "")
+        elif time.perf_counter() >= self.due:
+            say(line)
+            self.due = time.perf_counter() + 60
+
+
+def saved_args(args) -> dict[str, object]:
+    """Returns the arguments that belong to the run, not to one call of it."""
+    return {name: value for name, value in vars(args).items() if name not in OF_ONE_CALL}
+
+
+def command_line(args) -> str:
+    """Returns the command that repeats the run: what is not the default, and what decides most in any case."""
+    words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], vars(type(args)())
+    for name, value in saved_args(args).items():
+        if value != defaults[name] or name in ("env_id", "seed", "threads"):
+            words.append(f"--{'no-' if value is False else ''}{name.replace('_', '-')}")
+            words += [] if isinstance(value, bool) else [str(value)]
+    return shlex.join(words)
+
+
+def provenance() -> dict[str, object]:
+    """Returns what a reader needs to repeat a run besides its arguments: versions, commit, machine, threads."""
+    import torch
+
+    git = ["git", "-C", os.path.dirname(os.path.abspath(__file__)), "describe", "--always", "--dirty", "--abbrev=40"]
+    try:  # --exclude: no tags, the commit itself
+        commit = subprocess.run([*git, "--exclude=*"], capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "not a git checkout"
+    versions = {}
+    for package in ("torch", "gymnasium", "ale-py", "numpy", "opencv-python-headless", "tensorboard", "tyro"):
+        try:
+            versions[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:  # opencv-python in place of the headless one, for example
+            versions[package] = "unknown"
+    machine = f"{platform.platform()}, {available_cores()} cores, {torch.backends.cpu.get_cpu_capability()}"
+    threads = f"{torch.get_num_threads()} torch, OMP_WAIT_POLICY {os.environ.get('OMP_WAIT_POLICY', 'not set')}"
+    return {"commit": commit, "python": platform.python_version(), **versions, "machine": machine, "threads": threads}
+
+
+# -------------------------------------------------------------------------------------------- playing whole games
+def play(policy: Policy, envs: VectorEnv, num_games: int, seed: list[int]) -> list[tuple[float, int]]:
+    """Plays whole games without learning, and returns (score, agent steps) of each. Games that do not end are left out.
+
+    Each environment plays a fixed number of games; taking the first to finish would over-sample short ones.
+    """
+    obs, _ = envs.reset(seed=env_seeds(seed, envs.num_envs))
+    games = [[] for _ in range(envs.num_envs)]
+    # Environment n plays the games n, n + N, n + 2N, … of all
+    shares = [len(range(n, num_games, envs.num_envs)) for n in range(envs.num_envs)]
+    steps_left = 27_000 * max(shares)  # Atari's longest games; other environments may have no time limit
+    while steps_left > 0 and any(len(played) < share for played, share in zip(games, shares, strict=True)):
+        steps_left -= 1
+        obs, _, _, _, infos = envs.step(policy(obs))
+        for n in np.flatnonzero(infos.get("_episode", False)):
+            games[n].append((float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
+    return [game for played, share in zip(games, shares, strict=True) for game in played[:share]]
+
+
+def evaluate(args, policy: Policy, run: RunDirectory, state: dict) -> None:
+    """Plays `args.eval_episodes` games with a checkpoint's policy, for the terminal, TensorBoard and `eval.csv`."""
+    import torch
+
+    torch.set_num_threads(args.threads)
+    envs = make_envs(args.env_id, min(args.num_envs, args.eval_episodes), args.threads)
+    games = play(policy, envs, args.eval_episodes, seed=[args.seed, 1])
+    if len(games) < args.eval_episodes:
+        say(f"{args.eval_episodes - len(games)} of {args.eval_episodes} games did not end, they are left out")
+    scores = np.array([score for score, _ in games] or [math.nan])
+    std = scores.std(ddof=1) if len(scores) > 1 else 0.0
+    stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
+    run.log_evaluation(games, stats, state)
+    print(f"{len(games)} games at step {state['global_step']:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
+
+
+def record_game(args, policy: Policy, run: RunDirectory, step: int) -> None:
+    """Plays one game into `videos/` of the run, with its score in the file's name."""
+    path = os.path.join(run.path, "videos", f"step_{step}")
+    with run.reporting():
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        envs = make_envs(args.env_id, 1, args.threads, video=path + ".webm")
+        scores = [score for score, _ in play(policy, envs, 1, seed=[args.seed, 2])]
+        envs.close()
+        result = f"score_{scores[0]:.10g}" if scores else "without_end"
+        os.replace(path + ".webm", f"{path}_{result}.webm")
+
+
+def record_game_if_due(args, policy: Callable[[], Policy], run: RunDirectory, iteration: int) -> None:
+    """Records a game at the start and at each quarter of the training, with `--capture-video`."""
+    if args.capture_video and iteration in [args.num_iterations * k // 4 for k in range(5)]:
+        record_game(args, policy(), run, iteration * args.batch_size)
+
+
+# --------------------------------------------------------------------------------------------------- command line
+def open_run(args_class: type, description: str):
+    """Decides what this call is to do: train anew, resume, or evaluate. Refuses what cannot work, with status 2.
+
+    Returns the arguments, the environments, the run, its checkpoint (None for a new run) and the stop signal.
+    """
+    # TensorBoard's thread prints a traceback if the disk is full; RunDirectory says it in one line
+    threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
+    args = tyro.cli(args_class, description=description)
+    stop = StopSignal()
+    stop.listen()
+    run = state = None
+    name = "evaluate" if args.resume is None else "resume"
+    if (directory := getattr(args, name)) is not None:
+        run, state = RunDirectory.open(directory, name, args_class)
+        given = {"resume": args.resume, "evaluate": args.evaluate}
+        if name == "evaluate":  # these are the call's, not the run's
+            given |= {field: getattr(args_class(), field) for field in ("capture_video", "eval_episodes", "threads")}
+        args = tyro.cli(args_class, default=replace(args_class(**state["args"]), **given))
+        for field in ("env_id", "num_envs", "num_steps", "seed", "exp_name", "log_dir"):
+            if getattr(args, field) != state["args"][field]:
+                refuse(flag(field, getattr(args, field)), f"the run has {state['args'][field]}, which cannot change")
+    check(args)
+    if args.resume is not None and state["iteration"] >= args.last_iteration:
+        limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
+        print(f"{args.resume} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")
+        sys.exit()
+    try:
+        envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
+        if args.capture_video:
+            make_envs(args.env_id, 1, video="none yet")  # refused now, if it cannot be rendered
+    except ValueError as error:
+        refuse(flag("env_id", args.env_id), error)
+    run = run or RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
+    return args, envs, run, state, stop
+
+
+def finish(args, policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
+    """Ends a call whose agent is trained or loaded: evaluates it, or says how to go on. Exits with its status."""
+    stop.listen(signal.SIG_DFL)  # there is nothing left to save
+    if run.failed:
+        sys.exit(1)
+    state = run.load(type(args))  # as the last save left it
+    if stop.number and state["iteration"] < args.last_iteration:
+        stop_at = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
+        script = inspect.getfile(type(args))
+        say(f"Stopped; go on with: {shlex.join([sys.executable, script, '--resume', run.path, *stop_at])}")
+        sys.exit(128 + stop.number)
+    finished = args.last_iteration == args.num_iterations and not stop.number
+    if args.evaluate is not None or (finished and args.eval_episodes > 0):
+        evaluate(args, policy(), run, state)
+    if args.evaluate is not None and args.capture_video:  # a training has recorded its last agent already
+        record_game(args, policy(), run, state["global_step"])
+    sys.exit(1 if run.failed else 0)

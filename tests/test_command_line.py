@@ -130,11 +130,11 @@ ALL_BOUNDS = [(name, *bounds) for names, *bounds in BOUNDS for name in names.spl
 
 
 @pytest.mark.parametrize(("name", "bad", "said", "good"), ALL_BOUNDS, ids=[name for name, *_ in ALL_BOUNDS])
-def test_an_argument_outside_its_bounds_is_refused_by_name(name, bad, said, good, capsys):
+def test_an_argument_outside_its_bounds_is_refused_by_name(name, bad, said, good, capfd):
     for value in bad:
         with pytest.raises(SystemExit) as ended:
             check(acppo_atari.Args(**{name: value}))
-        line = capsys.readouterr().err
+        line = capfd.readouterr().err
         assert ended.value.code == 2 and line.startswith(f"--{name.replace('_', '-')} {value}: ") and said in line
     for value in good:
         check(acppo_atari.Args(**{name: value}))
@@ -151,10 +151,10 @@ def test_an_argument_outside_its_bounds_is_refused_by_name(name, bad, said, good
         ({"evaluate": "runs/a", "eval_episodes": 0}, "--evaluate runs/a: give --eval-episodes above 0, too"),
     ],
 )
-def test_arguments_that_do_not_go_together_are_refused(script, arguments, said, capsys):
+def test_arguments_that_do_not_go_together_are_refused(script, arguments, said, capfd):
     with pytest.raises(SystemExit) as ended:
         check(script.Args(**arguments))
-    assert ended.value.code == 2 and said in capsys.readouterr().err
+    assert ended.value.code == 2 and said in capfd.readouterr().err
 
 
 def test_arguments_at_the_edge_of_going_together_are_taken(script):

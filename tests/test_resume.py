@@ -281,16 +281,14 @@ def test_a_second_signal_ends_at_once(script, tmp_path, start):
 
 
 @pytest.mark.parametrize("where", ["value_loss", "surrogate"])
-def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, where, tmp_path, monkeypatch, capfd):
+def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, where, tmp_path, monkeypatch, call_main):
     function, calls = getattr(script, where), []
     poisoned = lambda *given: function(*given) * (float("nan") if calls.append(1) or len(calls) > 16 else 1)  # noqa: E731
     monkeypatch.setattr(script, where, poisoned)
-    with pytest.raises(SystemExit) as stopped:
-        train(script, tmp_path, **CARTPOLE, total_timesteps=1280, checkpoint_minutes=0)
-    assert stopped.value.code == 1
-    said = capfd.readouterr().err
+    status, out, said = call_main(script, *flags_of(**CARTPOLE, total_timesteps=1280, checkpoint_minutes=0))
+    assert (status, out) == (1, "") and said.count("\n") == 1
     assert re.search(r"not finite in iteration 2, step 256: .*(policy_loss|value_loss).*actor", said)
-    state = checkpoint_of(tmp_path)
+    state = checkpoint_of(run_dir_in(tmp_path / "runs"))
     assert state["global_step"] == 128
     assert all(value.isfinite().all() for value in state["agent"].values())
 

@@ -22,12 +22,8 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 BOTH = ("ppo_atari.py", "acppo_atari.py")
-ACPPO, WRAPPERS, GRID, FIGURES = (
-    ("acppo_atari.py",),
-    ("wrappers.py",),
-    ("benchmark/atari5.py",),
-    ("benchmark/figures.py",),
-)
+ACPPO, WRAPPERS, BOOKKEEPING = ("acppo_atari.py",), ("wrappers.py",), ("bookkeeping.py",)
+GRID, CLAIMS = ("benchmark/atari5.py",), ("benchmark/claims.py",)
 MATHEMATICS, TRAINING, RESUME = "tests/test_mathematics.py", "tests/test_training.py", "tests/test_resume.py"
 GAMES, PLAYING = "tests/test_wrappers.py", "tests/test_playing.py"
 
@@ -229,41 +225,41 @@ FAULTS = [
     Fault(
         "a resumed run plays its first games again",
         BOTH,
-        "env_seeds(args.seed, N, starts)",
+        "env_seeds(args.seed, N, run.num_starts)",
         "env_seeds(args.seed, N, 0)",
         f"{RESUME} -k other_games",
     ),
     Fault(
         "Adam's moments are not taken from the checkpoint",
-        BOTH,
+        BOOKKEEPING,
         """optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})""",
         "pass",
         f"{RESUME} -k moments_and",
     ),
     Fault(
         "the random state is not taken from the checkpoint",
-        BOTH,
+        BOOKKEEPING,
         """torch.set_rng_state(state["rng"][0])""",
         "pass",
         f"{RESUME} -k moments_and",
     ),
     Fault(
         "a run's directory is not locked",
-        WRAPPERS,
+        BOOKKEEPING,
         "fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)",
         "pass",
         f"{RESUME} -k two_processes",
     ),
     Fault(
         "event files keep what was logged after the checkpoint",
-        BOTH,
-        """run.cut_back(state["event_files"])""",
+        BOOKKEEPING,
+        """os.truncate(os.path.join(self.path, name), min(size, state["event_files"].get(name, 0)))""",
         "pass",
         f"{PLAYING} -k rid_of",
     ),
     Fault(
         "a checkpoint is written over the last one",
-        WRAPPERS,
+        BOOKKEEPING,
         """new = self.checkpoint + ".new\"""",
         "new = self.checkpoint",
         f"{RESUME} -k breaks_off",
@@ -330,7 +326,7 @@ FAULTS = [
     ),
     Fault(
         "runs of two seeds make a pair",
-        FIGURES,
+        CLAIMS,
         "[(ppos[seed], acppos[seed]) for seed in sorted(ppos.keys() & acppos.keys())]",
         "list(zip(ppos.values(), acppos.values()))",
         "tests/test_figures.py -k pair_has",
@@ -352,9 +348,9 @@ def copy_with(fault: Fault, directory: Path) -> None:
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, directory / name)
     for name in fault.files:
-        text = (directory / name).read_text()
+        text = (directory / name).read_text(encoding="utf-8")
         assert text.count(fault.old) == 1, f"{name} has {text.count(fault.old)} times: {fault.old}"
-        (directory / name).write_text(text.replace(fault.old, fault.new))
+        (directory / name).write_text(text.replace(fault.old, fault.new), encoding="utf-8")
 
 
 def first_failure(directory: Path, *arguments: str) -> str | None:

@@ -31,7 +31,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import EngFormatter
+from matplotlib.ticker import EngFormatter, NullFormatter
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
 from benchmark.claims import (
@@ -189,6 +189,7 @@ def draw_panel(axis: Axes, curves: Curves, game: str, column: str) -> None:
         axis.set_yscale("symlog", linthresh=10.0 ** round(math.log10(median)) if median > 0 else 1)
     elif column not in ("mean_return_100", "avg_clip_ratio"):
         axis.set_yscale("log")
+        axis.yaxis.set_minor_formatter(NullFormatter())  # names powers of ten alone
 
 
 def draw(out: Path, stages: list[Stage]) -> None:
@@ -219,7 +220,6 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     try:
         stages = make_stages(*read_grid(args.out))
-        draw(args.out, stages)
         readme = args.out / "README.md"
         if not readme.exists():
             write_text(readme, "# Results\n\n<!-- results -->\n<!-- end results -->\n")
@@ -229,6 +229,7 @@ def main() -> None:
         for readme, part in written:
             if not write_part(readme, "results", part):
                 refuse(str(readme), "has no <!-- results --> … <!-- end results -->, once, to write between")
+        draw(args.out, stages)
     except OSError as error:
         refuse(f"--out {args.out}", f"cannot use {error.filename} ({error.strerror})")
     print(f"{args.out}: runs.csv, curves.csv, figures/, README.md")

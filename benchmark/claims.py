@@ -362,22 +362,30 @@ def claims_table(stage: Stage) -> str:
 
 
 def spikes_table(curves: Curves, most: int = 10) -> str:
-    """The largest KLs of each run, and what else an iteration had; the last line of a run has its medians."""
+    """The largest KLs of each run, and what else was special at those iterations."""
+    columns = {
+        "kl": "KL",
+        "times": "× median",
+        "learning_rate": "learning rate",
+        "entropy": "entropy",
+        "explained_variance": "explained variance",
+        "clipfrac": "clip fraction",
+        "max_tv_distance": "largest TV distance",
+        "max_ratio_advantage": "largest abs((ρ − 1)Â)",
+        "games": "games ended",
+    }
     table = []
     for (variant, game, seed), curve in curves.items():
-        curve = curve.assign(games=curve.games_ended.diff().fillna(curve.games_ended))
+        curve = curve.assign(times=curve.kl / curve.kl.median(), games=curve.games_ended.diff())[list(columns)]
         largest = curve.nlargest(most, "kl")
-        for step, row in (*largest.iterrows(), ("median", curve.median())):
-            numbers = (row.kl, row.kl / curve.kl.median(), row.learning_rate, row.entropy, row.explained_variance)
-            numbers += (row.clipfrac, row.max_tv_distance, row.max_ratio_advantage)
-            cells = [f"{number:.3g}" if math.isfinite(number) else "–" for number in numbers]
-            where = step if step == "median" else f"{step:,}"
-            table.append([f"{game} {variant} {seed}", where, *cells, f"{row.games:.0f}"])
-    columns = ["run", "agent step", "KL", "× median", "learning rate", "entropy", "explained variance", "clip fraction"]
-    columns += ["largest TV distance", "largest abs((ρ − 1)Â)", "games ended"]
-    return markdown(columns, table) + (
-        f"\nThe {most} largest `losses/kl` of each run and its other curves at the same iteration. The line `median` is"
-        "\nover all iterations of the run, for each column by itself.\n"
+        lines = {f"{step:,}": row for step, row in largest.iterrows()}
+        lines |= {"their rank": curve.rank(pct=True).loc[largest.index].median(), "all: median": curve.median()}
+        for name, row in lines.items():
+            cells = [f"{number:.3g}" if math.isfinite(number) else "–" for number in row]
+            table.append([f"{game} {variant} {seed}", name, *cells])
+    return markdown(["run", "agent step", *columns.values()], table) + (
+        f"\nThe {most} largest `losses/kl` of each run, and its other curves at the same iterations. `their rank`: the"
+        "\nshare of the run's iterations that are not above them, median; `all: median`: of all iterations.\n"
     )
 
 

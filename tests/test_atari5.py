@@ -19,18 +19,20 @@ from conftest import ROOT, scalars
 
 ENDLESS = 10**9  # agent steps: no run ends before its test lets it
 GUARD = 300  # seconds, after which something hangs; no outcome depends on it
-# Two runs at once, however many cores there are
-GRID = ["--seeds", "1", "--total-timesteps", str(ENDLESS), "--cores", "2", "--no-figures"]
+GRID = ["--seeds", "1", "--total-timesteps", str(ENDLESS), "--no-figures"]
 
 
 def grid_command(out: Path, *flags: str) -> list[str]:
-    return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *flags]
+    cores = [] if "--address" in flags else ["--cores", "2"]  # two runs at once, however many there are
+    return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *cores, *flags]
 
 
-def start(out: Path, *flags: str, **given) -> subprocess.Popen:
-    # Elsewhere than in the repository: Ray's workers stand where the driver does
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": out}
-    return subprocess.Popen(grid_command(out, *flags), start_new_session=True, **pipes, **given)
+def start(out: Path, *flags: str, sigint=signal.SIG_DFL) -> subprocess.Popen:
+    # SIGINT: a suite that runs in the background of a script ignores it, as would all that it starts.
+    # cwd: elsewhere than in the repository, for Ray's workers stand where the driver does.
+    own = {"preexec_fn": lambda: signal.signal(signal.SIGINT, sigint), "start_new_session": True, "cwd": out}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(grid_command(out, *flags), **own, **pipes)
 
 
 def has_logged(event_file: Path) -> bool:
@@ -84,18 +86,23 @@ def interrupt(driver: subprocess.Popen) -> tuple[int, str]:
 
 def processes(out: Path) -> dict[str, list[int]]:
     """Returns the processes that train, by the name of their run."""
-    found = defaultdict(list)
+    found, parents = {}, {}
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().decode().split("\0")
+            parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
         except OSError:  # it has just ended
             continue
-        flags = dict(zip(words, words[1:]))
-        if "--resume" in flags and flags["--resume"].startswith(str(out)):
-            found[Path(flags["--resume"]).name.rpartition("__")[0]].append(int(process.name))
+        flags, pid = dict(zip(words, words[1:])), int(process.name)
+        if flags.get("--resume", "").startswith(str(out)):
+            found[pid], parents[pid] = Path(flags["--resume"]).name.rpartition("__")[0], parent
         elif flags.get("--log-dir") == str(out / "runs"):
-            found[f"{flags['--env-id']}__{flags['--exp-name']}__{flags['--seed']}"].append(int(process.name))
-    return found
+            found[pid], parents[pid] = f"{flags['--env-id']}__{flags['--exp-name']}__{flags['--seed']}", parent
+    by_name = defaultdict(list)
+    for pid, name in found.items():
+        if parents[pid] not in found:  # else it is about to become another program, such as git
+            by_name[name].append(pid)
+    return by_name
 
 
 # ------------------------------------------------------------------------------- one grid, interrupted and gone on with
@@ -205,8 +212,7 @@ def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid, 
 @pytest.mark.slow
 def test_a_grid_in_the_background_of_a_script_ends_on_sigterm(tmp_path):
     """There, as after `nohup … &`, SIGINT is ignored by all that the shell starts."""
-    ignoring = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)}
-    driver = start(tmp_path, "--games", "CartPole-v1", **ignoring)
+    driver = start(tmp_path, "--games", "CartPole-v1", sigint=signal.SIG_IGN)
     wait_for(lambda: both_log(tmp_path))
     driver.terminate()
     assert driver.wait(timeout=GUARD) == 130 and not processes(tmp_path)
@@ -342,9 +348,7 @@ def test_a_killed_node_costs_time_and_nothing_else(tmp_path):
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         node = cluster.add_node(num_cpus=1)
-        words = [word for word in grid_command(tmp_path, "--games", "CartPole-v1", "--address", cluster.address)]
-        del words[words.index("--cores") : words.index("--cores") + 2]
-        driver = subprocess.Popen(words, start_new_session=True, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
+        driver = start(tmp_path, "--games", "CartPole-v1", "--address", cluster.address)
         wait_for(lambda: both_log(tmp_path))
         before = {name: pids[0] for name, pids in processes(tmp_path).items()}
         killed = time.time()

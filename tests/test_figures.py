@@ -283,7 +283,8 @@ def test_the_largest_kls_stand_beside_what_else_their_iteration_had(tmp_path):
     assert [[row[name] for name in chosen] for row in named] == [
         ["2,048", "9", "9", "0.4", "–", "2"],
         ["3,072", "3", "3", "0.3", "0.5", "0"],
-        ["median", "1", "1", "0.3", "0.5", "1"],
+        ["their rank", "0.9", "0.9", "0.7", "0.667", "0.5"],  # 5 and 4 of 5; 4 and 3; 2 of 3; 3 and 1 of 4
+        ["all: median", "1", "1", "0.3", "0.5", "1.5"],
     ]
 
 

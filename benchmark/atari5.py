@@ -194,7 +194,7 @@ class Run:
 
 
 def tail(log: Path, after: int = 0) -> str:
-    """Returns the last 4 kB of a log, of what is beyond `after` bytes; nothing where there is none yet."""
+    """Returns the last 4 kB of a log, of what is beyond `after` bytes; nothing if there is none yet."""
     try:
         with log.open("rb") as file:
             file.seek(max(after, file.seek(0, os.SEEK_END) - 4096))
@@ -206,12 +206,12 @@ def tail(log: Path, after: int = 0) -> str:
 # --------------------------------------------------------------------------------------- in a worker process of Ray
 def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
     """Runs a run to its end, at most twice, and returns why it failed, or nothing. Ray calls it once more, on another
-    node, where this one has died.
+    node, if this one has died.
 
     The lock on the log keeps two processes off one run. It belongs to the open file, which the script inherits as its
     output: it lasts until the task and the script are gone, whichever of them lives longer.
     """
-    # Ray's cancel interrupts by this signal, which a worker ignores where the driver does, as under `nohup … &`
+    # Ray's cancel interrupts by this signal, which a worker ignores if the driver does, as under `nohup … &`
     signal.signal(signal.SIGINT, signal.default_int_handler)
     # Ray sets this for its workers; a run shall see what it would see without Ray
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
@@ -271,7 +271,7 @@ def run_grid(runs: list[Run], args: Args) -> None:
     import ray
 
     quiet = {"logging_level": logging.ERROR, "log_to_driver": False}
-    # "local" even where RAY_ADDRESS is set. Nothing is stored in the object store: near the least that Ray takes.
+    # "local" even if RAY_ADDRESS is set. Nothing is stored in the object store: near the least that Ray takes.
     cores = {"num_cpus": args.cores or available_cores(), "object_store_memory": 100_000_000}
     cores["include_dashboard"] = False
     pending = {}

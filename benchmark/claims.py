@@ -47,24 +47,17 @@ from benchmark.readme import markdown
 FINISHED = 0.9  # of its schedule
 FEWEST_PAIRS = 3
 UNDECIDED, TOO_EARLY = "cannot be told apart with these runs", "too early"
+OF_ITERATIONS = ("{:+.2%}".format, "{} of all iterations")
 # Claim → what it says; how a margin across games is written, and what is said of it
 CLAIMS = {
     "score": ("AC-PPO's final score is above PPO's", "{:+.3f}".format, "{} of human minus random score"),
     "KL": (
         "AC-PPO's KL between policy updates is smaller",
-        lambda margin: f"{math.exp(margin):.2f}",
+        lambda m: f"{math.exp(m):.2f}",
         "PPO's mean KL is {} times AC-PPO's",
     ),
-    "relative spikes": (
-        "AC-PPO has fewer KL spikes above the 99th percentile of PPO's",
-        "{:+.2%}".format,
-        "{} of all iterations",
-    ),
-    "own spikes": (
-        "AC-PPO has fewer KL spikes above ten times the run's own median",
-        "{:+.2%}".format,
-        "{} of all iterations",
-    ),
+    "relative spikes": ("AC-PPO has fewer KL spikes above the 99th percentile of PPO's", *OF_ITERATIONS),
+    "own spikes": ("AC-PPO has fewer KL spikes above ten times the run's own median", *OF_ITERATIONS),
     "clip ratio": ("AC-PPO's average clip ratio is near 0.1 (0.08 to 0.12)", "{:+.4f}".format, "{} inside the band"),
 }
 SIGNS = {"holds": "✓", "does not hold": "✗", UNDECIDED: "?"}
@@ -363,27 +356,19 @@ def claims_table(stage: Stage) -> str:
 
 def spikes_table(curves: Curves, most: int = 10) -> str:
     """The largest KLs of each run, and what else was special at those iterations."""
-    columns = {
-        "kl": "KL",
-        "times": "× median",
-        "learning_rate": "learning rate",
-        "entropy": "entropy",
-        "explained_variance": "explained variance",
-        "clipfrac": "clip fraction",
-        "max_tv_distance": "largest TV distance",
-        "max_ratio_advantage": "largest abs((ρ − 1)Â)",
-        "games": "games ended",
-    }
+    columns = "kl times learning_rate entropy explained_variance clipfrac max_tv_distance max_ratio_advantage games"
+    headings = "KL, × median, learning rate, entropy, explained variance, clip fraction, largest TV distance"
+    headings += ", largest abs((ρ − 1)Â), games ended"
     table = []
     for (variant, game, seed), curve in curves.items():
-        curve = curve.assign(times=curve.kl / curve.kl.median(), games=curve.games_ended.diff())[list(columns)]
+        curve = curve.assign(times=curve.kl / curve.kl.median(), games=curve.games_ended.diff())[columns.split()]
         largest = curve.nlargest(most, "kl")
         lines = {f"{step:,}": row for step, row in largest.iterrows()}
         lines |= {"their rank": curve.rank(pct=True).loc[largest.index].median(), "all: median": curve.median()}
         for name, row in lines.items():
             cells = [f"{number:.3g}" if math.isfinite(number) else "–" for number in row]
             table.append([f"{game} {variant} {seed}", name, *cells])
-    return markdown(["run", "agent step", *columns.values()], table) + (
+    return markdown(["run", "agent step", *headings.split(", ")], table) + (
         f"\nThe {most} largest `losses/kl` of each run, and its other curves at the same iterations. `their rank`: the"
         "\nshare of the run's iterations that are not above them, median; `all: median`: of all iterations.\n"
     )
@@ -403,59 +388,3 @@ def short_table(stages: list[Stage]) -> str:
         row.append(f"{math.exp(margins['KL'][game].mean()):.2f}")
         table.append([*row, judge(margins["score"][game]) if stage.final else TOO_EARLY])
     return markdown(["game", "n", "steps", "PPO", "AC-PPO", "KL of PPO / AC-PPO", "AC-PPO scores more"], table)
-
-
-READ = f"""KL is that between policy updates (`losses/kl`, nats, exact over actions), of every iteration up to the
-step given; shares are of iterations, and ppo's above its own 99th percentile is about 1 % by definition. The largest
-TV distance is over the visited states; ε / 2 bounds it only while every ratio is inside its range (proposition 2.4.1).
-
-The thesis's claims: ✓ holds, ✗ does not hold, ? {UNDECIDED}. A game is judged by its
-pairs of ppo and acppo with the same seed (the clip ratio by runs of acppo): {FEWEST_PAIRS} or more must be there, and
-all must agree; the table counts those with the claim's sign. Across games, the 95 % interval of the margins'
-interquartile mean must exclude "no difference"; with three seeds a game it does so for two equal algorithms one time
-in ten, not in twenty. A final score is judged only by runs that have done {100 * FINISHED:.0f} % of their schedule.
-The whole rule, and since when it stands, opens `benchmark/claims.py`.
-"""
-
-
-def bf16_note(runs: pd.DataFrame) -> str:
-    """Says which of these runs are in bfloat16."""
-    keys = [run for run in runs.itertuples() if json.loads(run.arguments).get("bf16")]
-    if len(keys) in (0, len(runs)):
-        return f"All in {'bfloat16' if keys else 'float32'}."
-    return f"In bfloat16: {', '.join(f'{run.game} {run.variant} {run.seed}' for run in keys)}; the others in float32."
-
-
-def coverage(stage: Stage) -> str:
-    """Says which runs a stage is made of, and how much of their schedule they have done."""
-    runs = stage.runs
-    totals = dict(zip(runs[KEY].itertuples(index=False, name=None), runs.total_timesteps))
-    done = [100 * curve.index[-1] / totals[key] for key, curve in stage.drawn.items()]
-    share = " to ".join(dict.fromkeys(f"{percent:.3g} %" for percent in (min(done), max(done))))
-    names = {name: ", ".join(map(str, sorted(runs[name].unique()))) for name in KEY}
-    commits = sorted({commit[:7] for of_run in runs.commit for commit in of_run.split("; ")})
-    machines = sorted({machine for of_run in runs.machine for machine in of_run.split("; ")})
-    schedules = " or ".join(f"{steps:,}" for steps in sorted(runs.total_timesteps.unique()))
-    text = (
-        f"{len(runs)} runs (variants {names['variant']}; games {names['game']}; seeds {names['seed']}), at {share} of a"
-        f" schedule of {schedules} agent steps."
-    )
-    if not stage.final:
-        text += " This is so at these steps, and says nothing about the schedule's end."
-    left_out = [f"{key[1]} {key[0]} {key[2]}" for key in stage.drawn if key not in stage.compared]
-    if left_out:
-        text += f" In the figures alone, being shorter than half of their game's longest: {', '.join(left_out)}."
-    return (
-        f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {', '.join(machines)}; each run's arguments, versions"
-        " and whole commit are in `runs.csv`.\n"
-    )
-
-
-def stage_tables(stage: Stage) -> dict[str, str]:
-    """Returns the tables by the name of the figure that they stand under."""
-    scores = [score_table(stage.compared)]
-    judged = [kl_table(stage.runs, stage.compared), claims_table(stage)]
-    if stage.final:
-        scores += [evaluation_table(stage.runs), human_table(stage.compared)]
-        judged.append(spikes_table(stage.compared))
-    return {"score": "\n".join(filter(None, scores)), "kl": "\n".join(judged)}

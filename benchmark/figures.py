@@ -35,20 +35,25 @@ from matplotlib.ticker import EngFormatter, NullFormatter
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
 from benchmark.claims import (
-    READ,
+    FEWEST_PAIRS,
+    FINISHED,
+    UNDECIDED,
     Curves,
     Stage,
-    bf16_note,
-    coverage,
+    claims_table,
     epsilons,
+    evaluation_table,
     games,
+    human_table,
+    kl_table,
     make_stages,
+    score_table,
     seeds,
     short_table,
-    stage_tables,
+    spikes_table,
     variants,
 )
-from benchmark.collect import DEFAULT_OUT, ROOT, read_grid
+from benchmark.collect import DEFAULT_OUT, KEY, ROOT, read_grid
 from benchmark.readme import write_part
 from bookkeeping import refuse, write_text
 from wrappers import FRAME_SKIP, find_atari_game
@@ -202,6 +207,63 @@ def draw(out: Path, stages: list[Stage]) -> None:
             for suffix, metadata in (("png", {}), ("svg", {"Date": None})):  # equal CSVs give equal files
                 figure.savefig(directory / f"new.{suffix}", metadata=metadata)
                 os.replace(directory / f"new.{suffix}", directory / f"{name}.{suffix}")
+
+
+# ------------------------------------------------------------------------------------------------- OUT/README.md
+READ = f"""KL is that between policy updates (`losses/kl`, nats, exact over actions), of every iteration up to the
+step given; shares are of iterations, and ppo's above its own 99th percentile is about 1 % by definition. The largest
+TV distance is over the visited states; ε / 2 bounds it only while every ratio is inside its range (proposition 2.4.1).
+
+The thesis's claims: ✓ holds, ✗ does not hold, ? {UNDECIDED}. A game is judged by its
+pairs of ppo and acppo with the same seed (the clip ratio by runs of acppo): {FEWEST_PAIRS} or more must be there, and
+all must agree; the table counts those with the claim's sign. Across games, the 95 % interval of the margins'
+interquartile mean must exclude "no difference"; with three seeds a game it does so for two equal algorithms one time
+in ten, not in twenty. A final score is judged only by runs that have done {100 * FINISHED:.0f} % of their schedule.
+The whole rule, and since when it stands, opens `benchmark/claims.py`.
+"""
+
+
+def bf16_note(runs: pd.DataFrame) -> str:
+    """Says which of these runs are in bfloat16."""
+    keys = [run for run in runs.itertuples() if json.loads(run.arguments).get("bf16")]
+    if len(keys) in (0, len(runs)):
+        return f"All in {'bfloat16' if keys else 'float32'}."
+    return f"In bfloat16: {', '.join(f'{run.game} {run.variant} {run.seed}' for run in keys)}; the others in float32."
+
+
+def coverage(stage: Stage) -> str:
+    """Says which runs a stage is made of, and how much of their schedule they have done."""
+    runs = stage.runs
+    totals = dict(zip(runs[KEY].itertuples(index=False, name=None), runs.total_timesteps))
+    done = [100 * curve.index[-1] / totals[key] for key, curve in stage.drawn.items()]
+    share = " to ".join(dict.fromkeys(f"{percent:.3g} %" for percent in (min(done), max(done))))
+    names = {name: ", ".join(map(str, sorted(runs[name].unique()))) for name in KEY}
+    commits = sorted({commit[:7] for of_run in runs.commit for commit in of_run.split("; ")})
+    machines = sorted({machine for of_run in runs.machine for machine in of_run.split("; ")})
+    schedules = " or ".join(f"{steps:,}" for steps in sorted(runs.total_timesteps.unique()))
+    text = (
+        f"{len(runs)} runs (variants {names['variant']}; games {names['game']}; seeds {names['seed']}), at {share} of a"
+        f" schedule of {schedules} agent steps."
+    )
+    if not stage.final:
+        text += " This is so at these steps, and says nothing about the schedule's end."
+    left_out = [f"{key[1]} {key[0]} {key[2]}" for key in stage.drawn if key not in stage.compared]
+    if left_out:
+        text += f" In the figures alone, being shorter than half of their game's longest: {', '.join(left_out)}."
+    return (
+        f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {', '.join(machines)}; each run's arguments, versions"
+        " and whole commit are in `runs.csv`.\n"
+    )
+
+
+def stage_tables(stage: Stage) -> dict[str, str]:
+    """Returns the tables by the name of the figure that they stand under."""
+    scores = [score_table(stage.compared)]
+    judged = [kl_table(stage.runs, stage.compared), claims_table(stage)]
+    if stage.final:
+        scores += [evaluation_table(stage.runs), human_table(stage.compared)]
+        judged.append(spikes_table(stage.compared))
+    return {"score": "\n".join(filter(None, scores)), "kl": "\n".join(judged)}
 
 
 def results_part(stages: list[Stage]) -> str:

@@ -229,7 +229,7 @@ class Row:
         return [sum(run["steps_per_second"] for run in runs) for runs in self.rounds]
 
     def all(self, column: str) -> list[float]:
-        """One number of every run, 0 where it has none."""
+        """One number of every run, 0 if it has none."""
         return [run.get(column, 0.0) for runs in self.rounds for run in runs]
 
 
@@ -273,10 +273,10 @@ def run_process(row: Row, needed: int, directory: Path) -> tuple[list[Iteration]
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
     else:
         command += ["--threads", threads, "--log-dir", str(directory)]
-    where = {"cwd": directory if contender.peer else None, "env": environment}
+    place = {"cwd": directory if contender.peer else None, "env": environment}
     with (directory / "stderr").open("w+", encoding="utf-8", errors="replace") as stderr:
         started = time.time()
-        child = subprocess.Popen(command, **where, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr)
+        child = subprocess.Popen(command, **place, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr)
         # Peak memory of this child alone. Linux counts what its parent held when it started, so a run never shows
         # less than this program holds: torch is left to the probes' own processes.
         _, status, usage = os.wait4(child.pid, 0)

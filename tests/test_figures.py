@@ -235,17 +235,17 @@ def test_finished_runs_are_compared_apart_from_beginnings_each_game_at_one_step(
     assert ends == {**lengths, ("ppo", "Pong", 1): 89, ("acppo", "Pong", 1): 89}
     without_short = {key: 45 for key in lengths if key[1] == "Pong" and key[2] < 3} | {("ppo", "Qbert", 1): 3}
     assert {key: len(curve) for key, curve in beginnings.compared.items()} == without_short
-    assert "In the figures alone, being shorter than half of their game's longest: Pong ppo 3." in claims.coverage(
+    assert "In the figures alone, being shorter than half of their game's longest: Pong ppo 3." in figures.coverage(
         beginnings
     )
-    assert "at 90 % to 100 % of a schedule of 102,400 agent steps. All in float32." in claims.coverage(finished)
+    assert "at 90 % to 100 % of a schedule of 102,400 agent steps. All in float32." in figures.coverage(finished)
 
 
 def test_it_is_said_which_runs_are_in_bfloat16(tmp_path):
     keys = [("ppo", "Pong", 1), ("acppo", "Pong", 1), ("ppo", "Pong", 2)]
     (stage,) = make_stages(tmp_path, {key: {"kl": [1]} for key in keys}, bf16=keys[:2])
     said = "In bfloat16: Pong ppo 1, Pong acppo 1; the others in float32."
-    assert said in claims.coverage(stage) and all(text.endswith(said) for text in figures.captions(stage).values())
+    assert said in figures.coverage(stage) and all(text.endswith(said) for text in figures.captions(stage).values())
 
 
 def test_both_spike_rates_as_counted_by_hand(tmp_path):
@@ -341,8 +341,8 @@ def test_before_90_percent_of_the_schedule_it_is_too_early_for_a_final_score_and
     score, *others = cells(claims.claims_table(early))[2:]
     assert score[1:] == ["too early"] * 3
     assert others == cells(claims.claims_table(finished))[3:] and "too early" not in str(others)
-    assert "interquartile" in claims.stage_tables(finished)["score"]
-    assert "interquartile" not in claims.stage_tables(early)["score"]
+    assert "interquartile" in figures.stage_tables(finished)["score"]
+    assert "interquartile" not in figures.stage_tables(early)["score"]
     assert [row[-1] for row in cells(claims.short_table([early]))[2:]] == ["too early"] * 2
     assert [row[-1] for row in cells(claims.short_table([finished]))[2:]] == ["✓ 3 of 3"] * 2
 

@@ -354,6 +354,17 @@ def claims_table(stage: Stage) -> str:
     return markdown(["claim", *games(stage.compared), "across games"], table)
 
 
+def progress_table(curves: Curves, parts: int = 10) -> str:
+    """Each run's score at the end of each tenth of its iterations, and its mean KL in that tenth."""
+    table = []
+    for (variant, game, seed), curve in curves.items():
+        tenths = [curve.iloc[len(curve) * i // parts : len(curve) * (i + 1) // parts] for i in range(parts)]
+        run = f"{game} {variant} {seed}"
+        table.append([run, "score", *(f"{tenth.mean_return_100.iloc[-1]:,.0f}" for tenth in tenths)])
+        table.append([run, "KL", *(f"{tenth.kl.mean():.2g}" for tenth in tenths)])
+    return markdown(["run", "of the run", *(f"{100 * (i + 1) // parts} %" for i in range(parts))], table)
+
+
 def spikes_table(curves: Curves, most: int = 10) -> str:
     """The largest KLs of each run, and what else was special at those iterations."""
     columns = "kl times learning_rate entropy explained_variance clipfrac max_tv_distance max_ratio_advantage games"

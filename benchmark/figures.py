@@ -47,6 +47,7 @@ from benchmark.claims import (
     human_table,
     kl_table,
     make_stages,
+    progress_table,
     score_table,
     seeds,
     short_table,
@@ -262,7 +263,7 @@ def stage_tables(stage: Stage) -> dict[str, str]:
     judged = [kl_table(stage.runs, stage.compared), claims_table(stage)]
     if stage.final:
         scores += [evaluation_table(stage.runs), human_table(stage.compared)]
-        judged.append(spikes_table(stage.compared))
+        judged += [progress_table(stage.compared), spikes_table(stage.compared)]
     return {"score": "\n".join(filter(None, scores)), "kl": "\n".join(judged)}
 
 

@@ -272,6 +272,14 @@ def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have(tmp_path):
     assert rows[0][2:8] == ["2", "102,400", "1.4", "1", "9", "9"]
 
 
+def test_progress_is_told_in_tenths_of_a_run(tmp_path):
+    columns = {"mean_return_100": range(1000, 1020), "kl": [1, 3] * 9 + [4, 6]}
+    (stage,) = make_stages(tmp_path, {("ppo", "Pong", 1): columns})
+    header, _, score, kl = cells(claims.progress_table(stage.compared))
+    assert (header[2], header[-1]) == ("10 %", "100 %")
+    assert score[1:4] == ["score", "1,001", "1,003"] and kl[1:] == ["KL", *["2"] * 9, "5"]
+
+
 def test_the_largest_kls_stand_beside_what_else_their_iteration_had(tmp_path):
     columns = {"kl": [1, 9, 3, 1, 1], "games_ended": [0, 2, 2, 5, 6], "learning_rate": [0.5, 0.4, 0.3, 0.2, 0.1]}
     columns["explained_variance"] = [math.nan, math.nan, 0.5, 0.25, 0.75]

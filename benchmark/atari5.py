@@ -13,7 +13,6 @@ own directories, OUT/logs what each of them was started with and has printed. Ex
 2 bad input, 130 interrupted.
 """
 
-import contextlib
 import ctypes
 import fcntl
 import importlib.util
@@ -32,16 +31,19 @@ import time
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import NoReturn
 
 import tyro
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for bookkeeping.py, if nothing is installed
+from bookkeeping import available_cores, refuse, say
+
+SCRIPTS = Path(__file__).resolve().parent.parent
 # A line each: the script and its arguments, ε and c always among them, so that a checkpoint can be held against them
 VARIANTS = {
     "ppo": ("ppo_atari.py", {"clip_coef": 0.1}),  # the thesis's two, chapter 4
     "acppo": ("acppo_atari.py", {"clip_coef": 0.16, "c": 1.0}),
     "ppo-wide": ("ppo_atari.py", {"clip_coef": 0.16}),  # is it the adaptation, or the width?
-    "product": ("acppo_atari.py", {"clip_coef": 0.027, "c": math.inf}),  # the product alone; δ by match_delta.py
+    "product": ("acppo_atari.py", {"clip_coef": 0.027, "c": math.inf}),  # the product alone; δ by match.py
     "acppo-c0.25": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.25}),  # sensitivity to c ...
     "acppo-c0.5": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.5}),
     "acppo-c2": ("acppo_atari.py", {"clip_coef": 0.16, "c": 2.0}),
@@ -53,7 +55,6 @@ VARIANTS = {
 }
 ATARI_5 = ("BattleZone", "DoubleDunk", "NameThisGame", "Phoenix", "Qbert")
 COMMON_FLAGS = ["--eval-episodes", "0"]  # the measure is the thesis's, the last 100 games of training
-SCRIPTS = Path(__file__).resolve().parent.parent
 # For the process of a dead task to end, with its iteration and its checkpoint, or a file server to notice its node's
 # death (NFS: 90 s)
 LOCK_SECONDS = 120
@@ -74,8 +75,13 @@ class Args:
     """agent steps of each run; Atari shows 4 frames for each, so this is the thesis's 20M frames (chapter 4)"""
     stop_at: int | None = None
     """agent steps at which each run ends for now; the schedule stays that of the whole run"""
+    bf16: bool = False
+    """start new runs with `--bf16`; a run that has a checkpoint goes on as it began"""
     cpus_per_run: int = 1
     """cores, and threads, of each run"""
+    cores: int | None = None
+    """cores of this machine that the grid uses, so cores / cpus_per_run runs at once; by default all that this process
+    may use. A cluster knows its own"""
     out: Path = Path(__file__).resolve().parent / "results"
     """directory for everything that comes of the grid; with `--address`, on a path that all nodes share. The default
     is for the thesis's games and length alone"""
@@ -86,52 +92,41 @@ class Args:
     dry_run: bool = False
     """print what would be run, and run nothing"""
 
-    def check(self) -> None:
-        """Ends the program with status 2 at the first argument that cannot work."""
-        for name in ("games", "seeds", "variants"):
-            if not getattr(self, name):
-                refuse(f"--{name}", "give at least one")
-        for game in self.games:
-            if not re.fullmatch(r"\w[\w./:-]{,100}", game):
-                refuse(f"--games {game!r}", "give names such as Phoenix, apart from each other")
-        for variant in self.variants:
-            if variant not in VARIANTS:
-                refuse(f"--variants {variant}", f"give any of {', '.join(VARIANTS)}")
-        if not all(0 <= seed < 2**64 for seed in self.seeds):
-            refuse(f"--seeds {' '.join(map(str, self.seeds))}", "give whole numbers from 0 to 2^64 - 1")
-        for name in ("total_timesteps", "stop_at", "cpus_per_run"):
-            if (given := getattr(self, name)) is not None and given < 1:
-                refuse(f"--{name.replace('_', '-')} {given}", "give a whole number above 0")
-        if self.address is None and self.cpus_per_run > available_cores():
-            refuse(f"--cpus-per-run {self.cpus_per_run}", f"this process may use {available_cores()} cores")
-        for package in ("ray", "matplotlib", "pandas"):
-            if importlib.util.find_spec(package) is None:
-                refuse(package, "is not installed; pip install -e '.[benchmark]'")
-        another = not set(self.games) <= set(ATARI_5) or self.total_timesteps != Args.total_timesteps
-        if another and self.out == Args.out:
-            refuse(f"--out {self.out}", "is for the thesis's games and length; give another directory")
-        if self.address not in (None, "auto"):  # Ray itself would knock for minutes
-            host, _, port = self.address.rpartition(":")
-            try:
-                socket.create_connection((host, int(port)), timeout=5).close()
-            except (OSError, ValueError, OverflowError):
-                refuse(f"--address {self.address}", "no Ray cluster answers there; give host:port, or auto")
 
-
-# These three are short forms of those in wrappers.py, whose import would take torch into every worker of Ray
-def available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def say(line: str) -> None:
-    """Writes to standard error, whatever has become of it: a terminal that is closed must not end the grid unclean."""
-    with contextlib.suppress(OSError):
-        print(line, file=sys.stderr, flush=True)
-
-
-def refuse(given: str, advice: str) -> NoReturn:
-    say(f"{given}: {advice}")
-    sys.exit(2)
+# Not a method: what stands in Args and Run travels to Ray's workers, which may not find bookkeeping.py
+def check(args: Args) -> None:
+    """Ends the program with status 2 at the first argument that cannot work."""
+    for name in ("games", "seeds", "variants"):
+        if not getattr(args, name):
+            refuse(f"--{name}", "give at least one")
+    for game in args.games:
+        if not re.fullmatch(r"\w[\w./:-]{,100}", game):
+            refuse(f"--games {game!r}", "give names such as Phoenix, apart from each other")
+    for variant in args.variants:
+        if variant not in VARIANTS:
+            refuse(f"--variants {variant}", f"give any of {', '.join(VARIANTS)}")
+    if not all(0 <= seed < 2**64 for seed in args.seeds):
+        refuse(f"--seeds {' '.join(map(str, args.seeds))}", "give whole numbers from 0 to 2^64 - 1")
+    for name in ("total_timesteps", "stop_at", "cpus_per_run", "cores"):
+        if (given := getattr(args, name)) is not None and given < 1:
+            refuse(f"--{name.replace('_', '-')} {given}", "give a whole number above 0")
+    if args.cores is not None and args.address is not None:
+        refuse(f"--cores {args.cores}", "is for this machine alone; leave it out beside --address")
+    cores = args.cores or available_cores()
+    if args.address is None and args.cpus_per_run > cores:
+        refuse(f"--cpus-per-run {args.cpus_per_run}", f"the grid has {cores} cores")
+    for package in ("ray", "matplotlib", "pandas"):
+        if importlib.util.find_spec(package) is None:
+            refuse(package, "is not installed; pip install -e '.[benchmark]'")
+    another = not set(args.games) <= set(ATARI_5) or args.total_timesteps != Args.total_timesteps
+    if another and args.out == Args.out:
+        refuse(f"--out {args.out}", "is for the thesis's games and length; give another directory")
+    if args.address not in (None, "auto"):  # Ray itself would knock for minutes
+        host, _, port = args.address.rpartition(":")
+        try:
+            socket.create_connection((host, int(port)), timeout=5).close()
+        except (OSError, ValueError, OverflowError):
+            refuse(f"--address {args.address}", "no Ray cluster answers there; give host:port, or auto")
 
 
 # ------------------------------------------------------------------------------------------------------- a run
@@ -170,14 +165,15 @@ class Run:
         if args.stop_at is not None:
             which["stop_at"] = args.stop_at
         words = [word for name, value in which.items() for word in (f"--{name.replace('_', '-')}", str(value))]
-        return [sys.executable, str(SCRIPTS / script), *words, *COMMON_FLAGS]
+        bf16 = ["--bf16"] if args.bf16 and not checkpoint else []
+        return [sys.executable, str(SCRIPTS / script), *words, *bf16, *COMMON_FLAGS]
 
     def look(self, args: Args) -> None:
         """Finds out how far it is, and whether what is there is this run: going on with another would mix two."""
         self.log_size = self.log(args).stat().st_size if self.log(args).exists() else 0
         if (checkpoint := self.checkpoint(args)) is None:
             return
-        import torch  # takes seconds, so only where there is something to read
+        import torch  # takes seconds, so only if there is something to read
 
         try:
             saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
@@ -198,7 +194,7 @@ class Run:
 
 
 def tail(log: Path, after: int = 0) -> str:
-    """Returns the last 4 kB of a log, of what is beyond `after` bytes; nothing where there is none yet."""
+    """Returns the last 4 kB of a log, of what is beyond `after` bytes; nothing if there is none yet."""
     try:
         with log.open("rb") as file:
             file.seek(max(after, file.seek(0, os.SEEK_END) - 4096))
@@ -210,12 +206,12 @@ def tail(log: Path, after: int = 0) -> str:
 # --------------------------------------------------------------------------------------- in a worker process of Ray
 def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
     """Runs a run to its end, at most twice, and returns why it failed, or nothing. Ray calls it once more, on another
-    node, where this one has died.
+    node, if this one has died.
 
     The lock on the log keeps two processes off one run. It belongs to the open file, which the script inherits as its
     output: it lasts until the task and the script are gone, whichever of them lives longer.
     """
-    # Ray's cancel interrupts by this signal, which a worker ignores where the driver does, as under `nohup … &`
+    # Ray's cancel interrupts by this signal, which a worker ignores if the driver does, as under `nohup … &`
     signal.signal(signal.SIGINT, signal.default_int_handler)
     # Ray sets this for its workers; a run shall see what it would see without Ray
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
@@ -275,8 +271,9 @@ def run_grid(runs: list[Run], args: Args) -> None:
     import ray
 
     quiet = {"logging_level": logging.ERROR, "log_to_driver": False}
-    # "local" even where RAY_ADDRESS is set. Nothing is stored in the object store: near the least that Ray takes.
-    cores = {"num_cpus": available_cores(), "object_store_memory": 100_000_000, "include_dashboard": False}
+    # "local" even if RAY_ADDRESS is set. Nothing is stored in the object store: near the least that Ray takes.
+    cores = {"num_cpus": args.cores or available_cores(), "object_store_memory": 100_000_000}
+    cores["include_dashboard"] = False
     pending = {}
     try:
         try:
@@ -365,7 +362,7 @@ class Progress:
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    args.check()
+    check(args)
     args.out = args.out.resolve()  # the tasks stand elsewhere
     # Seed by seed, variants innermost, so that what is compared is complete early
     grid = itertools.product(*map(dict.fromkeys, (args.seeds, args.games, args.variants)))  # each once

@@ -14,16 +14,13 @@ import sys
 import time
 import urllib.request
 from pathlib import Path
-from typing import NoReturn
 
 import tyro
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for bookkeeping.py, if nothing is installed
+from bookkeeping import refuse
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-
-
-def refuse(why: str) -> NoReturn:
-    print(why, file=sys.stderr)
-    sys.exit(2)
 
 
 def free_port() -> int:
@@ -33,7 +30,7 @@ def free_port() -> int:
 
 
 def wait_for(url: str, server: subprocess.Popen, seconds: float = 60) -> bool:
-    """Waits until the server answers; returns False where it has ended, or does not within the time."""
+    """Waits until the server answers; returns False if it ends, or does not within the time."""
     deadline = time.monotonic() + seconds
     while server.poll() is None and time.monotonic() < deadline:
         with contextlib.suppress(OSError):
@@ -53,9 +50,9 @@ def main(logdir: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path]
     """
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
-        refuse(f"none of {', '.join(BROWSERS)} is installed")
+        refuse(" or ".join(BROWSERS), "none is installed")
     if not any(logdir.rglob("events.out.tfevents*")):
-        refuse(f"{logdir}: no event files in it")
+        refuse(str(logdir), "no event files in it")
     port = free_port()
     module = [sys.executable, "-m", "tensorboard.main", "--logdir", str(logdir), "--port", str(port)]
     # --load_fast=false: the other reader shows what it has read so far, and the picture would come too early

@@ -4,6 +4,7 @@
     python benchmark/throughput.py ppo_atari.py "ppo_atari.py --bf16" --peer --cleanrl ../cleanrl
     python benchmark/throughput.py ppo_atari.py --jobs 1 2
     python benchmark/throughput.py ppo_atari.py --num-envs 8 16 32 64 --threads 1 2
+    python benchmark/throughput.py --table
 
 A contender is a script with its flags, in one string. Each run is a whole process on the processor alone, no GPU, and
 is read from what it logged. Runs are interleaved, A B A B, and compared round by round: a machine whose speed drifts
@@ -14,7 +15,8 @@ both are past their warm-up.
 Standard output gets three tables: speed; where an iteration's time goes; and how far each run is from two limits
 measured just before, the convolutions that the processor can compute and the steps that the bare emulator can make.
 The CSV gets a row for each process as soon as it ends, `time/…` in seconds. Expect about a minute for each contender
-and round at 600 steps/s.
+and round at 600 steps/s. `--table` measures nothing: it writes the README's table of speed, between `<!-- speed -->`
+and `<!-- end speed -->`, from the CSVs that are committed, `results/throughput_KIND.csv`, one a kind of processor.
 
 `--peer` needs `pip install -e '.[peer]'`. CleanRL needs an older Gymnasium and so an interpreter of its own,
 `--cleanrl-python`: one that has torch, gymnasium 0.29.1, ale-py 0.10.1, numpy 1, opencv-python-headless 4,
@@ -23,6 +25,7 @@ tensorboard and tyro.
 
 import csv
 import importlib.metadata
+import io
 import itertools
 import os
 import re
@@ -32,51 +35,35 @@ import subprocess
 import sys
 import tempfile
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
-from typing import NoReturn
 
-import ale_py
 import gymnasium as gym
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
+from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, measure_limits
+from benchmark.readme import markdown, write_part
+from bookkeeping import available_cores, refuse, write_text
+from wrappers import find_atari_game
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "benchmark" / "results"
 NUM_STEPS = 128  # agent steps of each environment in one iteration (appendix A): the default of every contender
-PHASES = tuple(
-    f"time/{phase}" for phase in "checkpoint inference environment storage advantages update kl_pass logging".split()
-)
-REST = "time/unaccounted"  # what an iteration takes beyond its phases
-OVERHEAD = (
-    "time/checkpoint",
-    "time/storage",
-    "time/advantages",
-    "time/logging",
-    REST,
-)  # outside environment, network and optimizer
-LIMITS = ("float32_gflops", "bfloat16_gflops", "emulator_steps_per_second")
+OF_PROCESS = ("time/first_iteration", "time/iteration", "time/unaccounted")  # every other `time/…` is a phase
+# A script's phases follow, by the names that it logs them under
 CSV_FIELDS = "date env_id contender commit torch cpu round job num_envs threads jobs warmup window".split()
-CSV_FIELDS += ["steps_per_second", "peak_mb", "time/first_iteration", "time/iteration", *PHASES, REST, *LIMITS]
-
-# Work of the Nature CNN in MFLOP a sample, a multiplication and its addition counted as two
-FIRST_LAYER = 2 * 20 * 20 * 32 * 256 / 1e6
-FORWARD = FIRST_LAYER + 2 * (9 * 9 * 64 * 512 + 7 * 7 * 64 * 576 + 3136 * 512) / 1e6  # 18.7
-# The backward pass makes two gradients at the forward pass's price, weights' and inputs'; nobody needs a screen's
-BACKWARD = 2 * FORWARD - FIRST_LAYER
-AGENT_STEP = FORWARD + 4 * (FORWARD + BACKWARD)  # 217: the rollout, then four epochs
-KL_PASS = FORWARD  # the scripts look at the rollout once more, peers do not
-
-
-def available_cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+CSV_FIELDS += ["steps_per_second", "peak_mb", *LIMITS, *OF_PROCESS]
+IN_README = ("ppo_atari.py", "ppo_atari.py --bf16")  # contenders of the README's table
 
 
 @dataclass
 class Args:
-    contenders: tyro.conf.Positional[tuple[str, ...]]
+    contenders: tyro.conf.Positional[tuple[str, ...]] = ()
     """scripts to measure, each with its flags in one string; all are compared with the first"""
     env_id: str = "Breakout"
     """the environment, named as for the scripts; limits and peers need an Atari game"""
@@ -99,8 +86,10 @@ class Args:
     """measure cleanrl/ppo_atari.py of this checkout of CleanRL too"""
     cleanrl_python: str = sys.executable
     """the interpreter that CleanRL is run with"""
-    csv: Path = Path(__file__).parent / "results" / "throughput.csv"
-    """file that the rows are appended to"""
+    csv: Path = RESULTS / "throughput.csv"
+    """file that the rows are added to"""
+    table: bool = False
+    """measure nothing, write the README's table"""
 
     def check(self) -> None:
         """Ends the program with status 2 at the first argument that cannot work."""
@@ -110,36 +99,45 @@ class Args:
                 refuse(f"--{name.replace('_', '-')} {smallest}", "give a number above 0")
         if not self.contenders:
             refuse("no contender", "name a script, for example ppo_atari.py")
-        if (self.peer or self.cleanrl) and (find_atari_game(self.env_id) is None or "/" in self.env_id):
+        try:
+            atari = find_atari_game(self.env_id)
+        except ValueError as error:
+            refuse(f"--env-id {self.env_id}", error)
+        if (self.peer or self.cleanrl) and (atari is None or atari[1] > 0):
             refuse(f"--env-id {self.env_id}", "peers play Atari without sticky actions; give a game such as Breakout")
 
 
-def refuse(given: str, advice: str) -> NoReturn:
-    print(f"{given}: {advice}", file=sys.stderr)
-    sys.exit(2)
+def peer_id(env_id: str) -> str:
+    """Returns the name that peers know a game by."""
+    rom, _ = find_atari_game(env_id)
+    specs = (spec for spec in gym.registry.values() if spec.namespace == "ALE" and spec.kwargs["game"] == rom)
+    return f"{next(specs).name}NoFrameskip-v4"
 
 
-def find_atari_game(env_id: str) -> tuple[str, str] | None:
-    """Returns a game's registered name and its ROM (`Breakout`, `breakout`), or None where it is not one."""
-    gym.register_envs(ale_py)
-    name = re.sub(r"^ale/|_|noframeskip-v4$|-v5$", "", env_id.lower())
-    games = {spec.name.lower(): spec for spec in gym.registry.values() if spec.namespace == "ALE"}
-    return (games[name].name, games[name].kwargs["game"]) if name in games else None
+def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
+    """Returns the names of a CSV's columns, and its rows."""
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(reader := csv.DictReader(file))
+        return list(reader.fieldnames or []), rows
 
 
-def prepare_csv(path: Path) -> None:
-    """Makes the file with its header, or checks that rows can follow those that it has."""
+def add_rows(path: Path, rows: list[dict[str, object]]) -> None:
+    """Adds rows to a CSV, and a column for each phase that it has not had; what a row lacks stays empty."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a+", newline="") as file:
-            file.seek(0)
-            header = next(csv.reader(file), None)
-            if header is None:
-                csv.writer(file).writerow(CSV_FIELDS)
-    except OSError as error:
-        refuse(f"--csv {path}", f"cannot be written ({error.strerror}); give another file")
-    if header not in (None, CSV_FIELDS):
-        refuse(f"--csv {path}", "it holds other columns than these runs have; give another file")
+        if not os.access(path if path.exists() else path.parent, os.W_OK):
+            raise PermissionError(13, "Permission denied")
+        header, known = read_csv(path) if path.exists() else (CSV_FIELDS, [])
+        if not {"contender", "steps_per_second"} <= set(header):
+            refuse(f"--csv {path}", "it holds other columns than these runs have; give another file")
+        if rows:
+            columns = list(dict.fromkeys([*header, *(name for row in rows for name in row)]))
+            writer = csv.DictWriter(text := io.StringIO(newline=""), columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows([*known, *rows])
+            write_text(path, text.getvalue())
+    except (OSError, UnicodeDecodeError) as error:
+        refuse(f"--csv {path}", f"cannot be written ({getattr(error, 'strerror', error)}); give another file")
 
 
 # -------------------------------------------------------------------------------------------------- contenders
@@ -176,7 +174,7 @@ def make_contenders(args: Args) -> list[Contender]:
         except importlib.metadata.PackageNotFoundError:
             refuse("--peer", "Stable-Baselines3 is not installed; pip install -e '.[peer]'")
         script = Path(__file__).resolve().parent / "sb3_ppo.py"
-        command = (sys.executable, str(script), "--env-id", f"{find_atari_game(args.env_id)[0]}NoFrameskip-v4")
+        command = (sys.executable, str(script), "--env-id", peer_id(args.env_id))
         contenders.append(Contender(f"Stable-Baselines3 {version}", command, commit_of(script.parent), torch, True))
     if args.cleanrl:
         script, python = args.cleanrl.resolve() / "cleanrl" / "ppo_atari.py", shutil.which(args.cleanrl_python)
@@ -186,8 +184,7 @@ def make_contenders(args: Args) -> list[Contender]:
         if not python or not (torch := subprocess.run(ask, capture_output=True, text=True).stdout.strip()):
             refuse(f"--cleanrl-python {args.cleanrl_python}", "not an interpreter that has torch")
         # The prefix has Gymnasium import ale-py: under 0.29 the versions that ship ROMs do not register by themselves
-        env_id = f"ale_py:{find_atari_game(args.env_id)[0]}NoFrameskip-v4"
-        command = (os.path.abspath(python), str(script), "--env-id", env_id, "--no-cuda")
+        command = (os.path.abspath(python), str(script), "--env-id", f"ale_py:{peer_id(args.env_id)}", "--no-cuda")
         environment = {"PYTHONPATH": str(args.cleanrl.resolve())}
         contenders.append(Contender("CleanRL", command, commit_of(script.parent), torch, True, environment))
     return contenders
@@ -232,7 +229,7 @@ class Row:
         return [sum(run["steps_per_second"] for run in runs) for runs in self.rounds]
 
     def all(self, column: str) -> list[float]:
-        """One number of every run, 0 where it has none."""
+        """One number of every run, 0 if it has none."""
         return [run.get(column, 0.0) for runs in self.rounds for run in runs]
 
 
@@ -243,7 +240,8 @@ def read_iterations(directory: Path) -> list[Iteration]:
     reader.Reload()
     if "charts/SPS" not in (logged := reader.Tags()["scalars"]):
         return []
-    seconds = {tag: {event.step: event.value for event in reader.Scalars(tag)} for tag in PHASES if tag in logged}
+    phases = [tag for tag in logged if tag.startswith("time/")]
+    seconds = {tag: {event.step: event.value for event in reader.Scalars(tag)} for tag in phases}
     return [
         Iteration(event.wall_time, event.step, {tag: at_step[event.step] for tag, at_step in seconds.items()})
         for event in reader.Scalars("charts/SPS")
@@ -260,7 +258,8 @@ def measure(iterations: list[Iteration], start: float, end: float) -> Run:
     for tag in inside[0].phases:
         run[tag] = median(iteration.phases[tag] for iteration in inside[1:])
     if inside[0].phases:
-        run[REST] = median(total - sum(later.phases.values()) for total, later in zip(seconds, inside[1:]))
+        beyond = [total - sum(later.phases.values()) for total, later in zip(seconds, inside[1:])]
+        run["time/unaccounted"] = median(beyond)
     return run
 
 
@@ -274,10 +273,10 @@ def run_process(row: Row, needed: int, directory: Path) -> tuple[list[Iteration]
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
     else:
         command += ["--threads", threads, "--log-dir", str(directory)]
-    where = {"cwd": directory if contender.peer else None, "env": environment}
-    with (directory / "stderr").open("w+", errors="replace") as stderr:
+    place = {"cwd": directory if contender.peer else None, "env": environment}
+    with (directory / "stderr").open("w+", encoding="utf-8", errors="replace") as stderr:
         started = time.time()
-        child = subprocess.Popen(command, **where, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr)
+        child = subprocess.Popen(command, **place, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr)
         # Peak memory of this child alone. Linux counts what its parent held when it started, so a run never shows
         # less than this program holds: torch is left to the probes' own processes.
         _, status, usage = os.wait4(child.pid, 0)
@@ -308,71 +307,8 @@ def last_words(stderr: str) -> str:
     return (box[1] if box else (stderr.strip() or "no message").splitlines()[-1]).strip()
 
 
-# ------------------------------------------------------------------------------------------------------ limits
-def probe_convolutions(threads: int, dtype_name: str, seconds: float = 2.0) -> float:
-    """Returns the best GFLOP/s of the network's three convolutions, forward and backward on 256 samples.
-
-    Without bfloat16 instructions each takes about a second, so the time is checked after every one of them.
-    """
-    import torch
-
-    torch.set_num_threads(threads)
-    layers = []
-    for inputs, outputs, kernel, stride, size in ((4, 32, 8, 4, 84), (32, 64, 4, 2, 20), (64, 64, 3, 1, 9)):
-        layout = {"dtype": getattr(torch, dtype_name), "memory_format": torch.channels_last}
-        screens = torch.rand(256, inputs, size, size).to(**layout).requires_grad_(inputs > 4)
-        layers.append((torch.nn.Conv2d(inputs, outputs, kernel, stride).to(**layout), screens))
-    best, stop = 0.0, time.perf_counter() + seconds
-    for convolution, screens in itertools.cycle(layers):
-        if (start := time.perf_counter()) > stop:
-            return best
-        output = convolution(screens)
-        output.backward(output.detach())
-        elapsed = time.perf_counter() - start
-        flop = 2 * output.numel() * convolution.weight[0].numel() * (3 if screens.requires_grad else 2)
-        best = max(best, flop / elapsed / 1e9)
-
-
-def probe_emulator(rom: str, num_envs: int, threads: int, seconds: float = 2.0) -> float:
-    """Returns the best steps/s of the emulator over an eighth of the time: random actions, the network's screens."""
-    import numpy as np
-    from ale_py.vector_env import AtariVectorEnv
-
-    envs = AtariVectorEnv(rom, num_envs, num_threads=threads, use_fire_reset=False)
-    envs.reset(seed=1)
-    actions = itertools.cycle(np.random.default_rng(1).integers(envs.single_action_space.n, size=(1000, num_envs)))
-    best = 0.0
-    for _ in range(8):
-        steps, start = 0, time.perf_counter()
-        while (elapsed := time.perf_counter() - start) < seconds / 8:
-            envs.step(next(actions))
-            steps += num_envs
-        best = max(best, steps / elapsed)
-    return best
-
-
-def measure_limits(args: Args) -> dict[tuple[int, int], dict[str, float]]:
-    """Returns the limits for each number of environments and threads; none outside Atari."""
-
-    def in_own_process(function, *arguments):  # where thread counts hold
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            return pool.submit(function, *arguments).result()
-
-    limits = {}
-    for threads in args.threads if (game := find_atari_game(args.env_id)) else ():
-        convolutions = [in_own_process(probe_convolutions, threads, dtype) for dtype in ("float32", "bfloat16")]
-        for num_envs in args.num_envs:
-            emulator = in_own_process(probe_emulator, game[1], num_envs, threads)
-            limits[num_envs, threads] = dict(zip(LIMITS, [*convolutions, emulator]))
-    return limits
-
-
 # ------------------------------------------------------------------------------------------------------ tables
 LABEL = ["contender", "envs", "threads", "jobs"]
-
-
-def markdown(header: list[str], rows: list[list[str]]) -> str:
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["-"] * len(header), *rows)) + "\n"
 
 
 def spread(values: list[float], digits: int = 0) -> str:
@@ -402,17 +338,17 @@ def speed_table(rows: list[Row]) -> str:
 
 def phase_table(rows: list[Row]) -> str:
     """Milliseconds and share of an iteration: medians, so they need not add up exactly. Peers log no phases."""
+    rows = [row for row in rows if not row.contender.peer]
+    logged = dict.fromkeys(tag for row in rows for runs in row.rounds for run in runs for tag in run)
+    tags = [*(tag for tag in logged if tag.startswith("time/") and tag not in OF_PROCESS), "time/unaccounted"]
     table = []
     for row in rows:
         iteration = row.all("time/iteration")
-        columns = [row.all(tag) for tag in (*PHASES, REST)]
-        columns.append([sum(parts) for parts in zip(*(row.all(tag) for tag in OVERHEAD))])
+        columns = [row.all(tag) for tag in tags]
         shares = [median(s / total for s, total in zip(seconds, iteration)) for seconds in columns]
         cells = [f"{1000 * median(seconds):.0f} ({share:.1%})" for seconds, share in zip(columns, shares)]
-        if not row.contender.peer:
-            table.append([*row.label, f"{1000 * median(iteration):.0f}", *cells])
-    phases = [tag.removeprefix("time/") for tag in (*PHASES, REST)]
-    return markdown([*LABEL, "iteration, ms", *phases, "outside environment, network and optimizer"], table)
+        table.append([*row.label, f"{1000 * median(iteration):.0f}", *cells])
+    return markdown([*LABEL, "iteration, ms", *(tag.removeprefix("time/") for tag in tags)], table)
 
 
 def limits_table(rows: list[Row], limits: dict[tuple[int, int], dict[str, float]]) -> str:
@@ -428,19 +364,53 @@ def limits_table(rows: list[Row], limits: dict[tuple[int, int], dict[str, float]
     return markdown([*LABEL, *columns, *(f"{column} and emulator in turn" for column in columns[:2])], table)
 
 
+def readme_table(directory: Path = RESULTS) -> str:
+    """Returns the README's table of speed: a line for each kind of processor and way to call the script."""
+    table, settings = [], {}
+    for path in sorted(directory.glob("throughput_*.csv")):
+        # What ran in one round of one call is compared: there, contender → its row
+        rounds: dict[tuple, dict[str, dict]] = {}
+        for row in read_csv(path)[1]:
+            rounds.setdefault((row.get("call"), row["round"]), {})[row["contender"]] = row
+        for name in IN_README:
+            if not (shared := [of_round for of_round in rounds.values() if name in of_round]):
+                continue
+            times = {peer: [] for peer in ("CleanRL", "Stable-Baselines3")}
+            for of_round, peer in itertools.product(shared, times):
+                for contender, row in of_round.items():
+                    if contender.startswith(peer):
+                        speeds = (float(run["steps_per_second"]) for run in (of_round[name], row))
+                        times[peer].append(next(speeds) / next(speeds))
+            runs = [of_round[name] for of_round in shared]
+            cells = [f"{runs[0]['cpu']}, {path.stem.removeprefix('throughput_').upper()}", f"`{name}`"]
+            cells.append(spread([float(run["steps_per_second"]) for run in runs]))
+            cells += [spread(ratios, 2) if ratios else "–" for ratios in times.values()]
+            table.append([*cells, spread([float(run["peak_mb"]) for run in runs])])
+            setting = "{env_id}, {num_envs} environments, {threads} threads, torch {torch}"
+            settings[setting.format(**runs[0])] = None
+    columns = ["processor", "script", "steps/s", "× CleanRL", "× Stable-Baselines3", "peak MB"]
+    said = f"{'; '.join(settings)}: median (minimum to maximum) of rounds in turn, ratios round by round."
+    return markdown(columns, table) + f"\n{said}\n"
+
+
 # ------------------------------------------------------------------------------------------------- command line
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
+    if args.table:
+        if not write_part(ROOT / "README.md", "speed", readme_table()):
+            refuse("--table", "README.md has no <!-- speed --> … <!-- end speed -->, once, to write between")
+        return
     args.check()
     contenders = make_contenders(args)
-    prepare_csv(args.csv)  # last, so that nothing refused above leaves a file behind
+    add_rows(args.csv, [])  # last, so that nothing refused above leaves a file behind
     # The contenders of one setting follow each other, so that what is compared most is closest in time
     settings = itertools.product(args.num_envs, args.threads, args.jobs)
     rows = [Row(contender, *setting) for setting in settings for contender in contenders]
-    cpuinfo = Path("/proc/cpuinfo").read_text() if Path("/proc/cpuinfo").exists() else ""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     cpu = (re.findall(r"model name\s*: (.*)", cpuinfo) or ["unknown processor"])[0]
 
-    limits = measure_limits(args)
+    atari = find_atari_game(args.env_id)
+    limits = measure_limits(atari[0], args.num_envs, args.threads) if atari else {}
     for (num_envs, threads), limit in limits.items():
         float32, bfloat16, emulator = (f"{value:,.0f}" for value in limit.values())
         print(
@@ -456,10 +426,9 @@ def main() -> None:
                 numbers = {**run, **limits.get((row.num_envs, row.threads), {})}
                 numbers = {column: f"{value:.6g}" for column, value in numbers.items()}
                 identity = {"contender": row.contender.name, "date": date, "cpu": cpu, "round": number, "job": job}
-                # The row after the arguments: it has one value where they have several
-                record = {**vars(args), **vars(row.contender), **vars(row), **identity, **numbers}
-                with args.csv.open("a", newline="") as file:
-                    csv.DictWriter(file, CSV_FIELDS, extrasaction="ignore").writerow(record)
+                # The row after the arguments: it has one value for those that have several
+                record = {**vars(args), **vars(row.contender), **vars(row), **identity}
+                add_rows(args.csv, [{**{name: record.get(name, "") for name in CSV_FIELDS}, **numbers}])
 
     versions = f"torch {contenders[0].torch}, commit {contenders[0].commit}"
     protocol = f"{args.rounds} rounds of {args.window} iterations after {args.warmup}; median (minimum to maximum)"

@@ -1,4 +1,4 @@
-"""The grid on real Ray: one command that is interrupted, called again, fails in part, and loses a node."""
+"""The grid on real Ray: one command that is interrupted, called again, fails in part, and loses a worker and a node."""
 
 import fcntl
 import os
@@ -17,28 +17,31 @@ from benchmark import atari5
 from benchmark.atari5 import Args, Progress, Run
 from conftest import ROOT, scalars
 
-# Agent steps of a run: many seconds, for two runs do not start at the same moment, and neither may end before both have
-# been interrupted
-TOTAL = 80 * 1024
-GRID = ["--variants", "ppo", "acppo", "--seeds", "1", "--total-timesteps", str(TOTAL), "--no-figures"]
+ENDLESS = 10**9  # agent steps: no run ends before its test lets it
+GUARD = 300  # seconds, after which something hangs; no outcome depends on it
+GRID = ["--seeds", "1", "--total-timesteps", str(ENDLESS), "--no-figures"]
 
 
 def grid_command(out: Path, *flags: str) -> list[str]:
-    return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *flags]
+    cores = [] if "--address" in flags else ["--cores", "2"]  # two runs at once, however many there are
+    return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *cores, *flags]
 
 
-def call(out: Path, *flags: str) -> subprocess.CompletedProcess:
-    return subprocess.run(grid_command(out, *flags), capture_output=True, text=True, timeout=300)
-
-
-def start(out: Path, *flags: str, **given) -> subprocess.Popen:
+def start(out: Path, *flags: str, sigint=signal.SIG_DFL) -> subprocess.Popen:
+    # SIGINT: a suite that runs in the background of a script ignores it, as would all that it starts.
+    # cwd: elsewhere than in the repository, for Ray's workers stand where the driver does.
+    own = {"preexec_fn": lambda: signal.signal(signal.SIGINT, sigint), "start_new_session": True, "cwd": out}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(grid_command(out, *flags), start_new_session=True, **pipes, **given)
+    return subprocess.Popen(grid_command(out, *flags), **own, **pipes)
+
+
+def has_logged(event_file: Path) -> bool:
+    return b"losses/kl" in event_file.read_bytes()
 
 
 def both_log(out: Path) -> bool:
-    """Are two runs past their first iterations?"""
-    return len([path for path in (out / "runs").glob("*/events.*") if path.stat().st_size > 8000]) == 2
+    """Have two runs finished an iteration?"""
+    return sum(map(has_logged, (out / "runs").glob("*/events.*"))) == 2
 
 
 def run_dirs(out: Path) -> dict[str, Path]:
@@ -57,90 +60,129 @@ def steps(run_dir: Path) -> list[int]:
     return [step for step, _ in scalars(run_dir).get("charts/learning_rate", [])]
 
 
+def is_one_curve(run_dir: Path) -> bool:
+    """Is each step logged once, up to that of the checkpoint?"""
+    return steps(run_dir) == list(range(1024, global_step(run_dir) + 1, 1024)) != []
+
+
 def attempts(out: Path, name: str) -> list[str]:
     """Returns the commands that a run was started with."""
     return re.findall(r"^\d{4}-.*?\$ (.*)", (out / "logs" / f"{name}.log").read_text(), re.MULTILINE)
 
 
-def wait_for(condition, seconds: float = 120) -> None:
-    deadline = time.monotonic() + seconds
+def wait_for(condition) -> None:
+    deadline = time.monotonic() + GUARD
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.05)
 
 
+def interrupt(driver: subprocess.Popen) -> tuple[int, str]:
+    """Ends the grid as Ctrl-C in a terminal does; returns its status and what it said."""
+    os.killpg(driver.pid, signal.SIGINT)
+    said = driver.communicate(timeout=GUARD)[1]
+    return driver.returncode, said
+
+
 def processes(out: Path) -> dict[str, list[int]]:
     """Returns the processes that train, by the name of their run."""
-    found = defaultdict(list)
+    found, parents = {}, {}
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().decode().split("\0")
+            parent = int((process / "stat").read_text().rpartition(")")[2].split()[1])
         except OSError:  # it has just ended
             continue
-        flags = dict(zip(words, words[1:]))
-        if "--resume" in flags and flags["--resume"].startswith(str(out)):
-            found[Path(flags["--resume"]).name.rpartition("__")[0]].append(int(process.name))
+        flags, pid = dict(zip(words, words[1:])), int(process.name)
+        if flags.get("--resume", "").startswith(str(out)):
+            found[pid], parents[pid] = Path(flags["--resume"]).name.rpartition("__")[0], parent
         elif flags.get("--log-dir") == str(out / "runs"):
-            found[f"{flags['--env-id']}__{flags['--exp-name']}__{flags['--seed']}"].append(int(process.name))
-    return found
+            found[pid], parents[pid] = f"{flags['--env-id']}__{flags['--exp-name']}__{flags['--seed']}", parent
+    by_name = defaultdict(list)
+    for pid, name in found.items():
+        if parents[pid] not in found:  # else it is about to become another program, such as git
+            by_name[name].append(pid)
+    return by_name
 
 
 # ------------------------------------------------------------------------------- one grid, interrupted and gone on with
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory):
-    """Interrupts the grid as Ctrl-C in a terminal does, then calls it again with a game that does not exist."""
+    """Interrupts two runs, then takes one of them two iterations further, beside a game that does not exist."""
     out = tmp_path_factory.mktemp("grid")
     driver = start(out, "--games", "CartPole-v1")
     wait_for(lambda: both_log(out))
-    os.killpg(driver.pid, signal.SIGINT)
-    said = driver.communicate(timeout=60)[1]
+    status, said = interrupt(driver)
     interrupted = {name: (global_step(path), steps(path)) for name, path in run_dirs(out).items()}
     left = processes(out)
-    return out, (driver.returncode, said, interrupted, left), call(out, "--games", "CartPole-v1", "Brekout")
+    goal = interrupted["CartPole-v1__ppo__1"][0] + 2048
+    flags = ("--games", "CartPole-v1", "Brekout", "--variants", "ppo", "--stop-at", str(goal))
+    again = subprocess.run(grid_command(out, *flags), cwd=out, capture_output=True, text=True, timeout=GUARD)
+    return out, (status, said, interrupted, left), goal, again
+
+
+@pytest.fixture
+def call(monkeypatch, capfd):
+    """Calls the grid's `main` in this process, for what starts no run: (exit status, stdout, stderr)."""
+
+    def call_main(*flags: str) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["atari5.py", *flags])
+        with pytest.raises(SystemExit) as ended:
+            atari5.main()
+        return ended.value.code, *capfd.readouterr()
+
+    return call_main
+
+
+def finished(grid) -> list[str]:
+    """Returns the flags of a grid whose one run is finished."""
+    out, _, goal, _ = grid
+    return [*GRID, "--out", str(out), "--games", "CartPole-v1", "--variants", "ppo", "--stop-at", str(goal)]
 
 
 def test_an_interrupted_grid_leaves_every_run_at_a_checkpoint_of_its_last_step(grid):
-    _, (status, said, interrupted, left), _ = grid
+    _, (status, said, interrupted, left), _, _ = grid
     assert status == 130 and "go on with the same command" in said
     assert set(interrupted) == {"CartPole-v1__ppo__1", "CartPole-v1__acppo__1"} and not left
     for saved, logged in interrupted.values():
-        assert 0 < saved < TOTAL and logged[-1] == saved
+        assert logged == list(range(1024, saved + 1, 1024)) != []
 
 
-def test_called_again_it_finishes_each_curve_without_a_gap_or_a_repetition(grid):
-    out, _, _ = grid
-    for name, run_dir in run_dirs(out).items():
-        assert steps(run_dir) == list(range(1024, TOTAL + 1, 1024)) and global_step(run_dir) == TOTAL
-        first, again = attempts(out, name)
-        assert "--resume" not in first and f"--resume {run_dir}" in again
+def test_called_again_it_finishes_the_curve_without_a_gap_or_a_repetition(grid):
+    out, _, goal, _ = grid
+    run_dir = run_dirs(out)["CartPole-v1__ppo__1"]
+    assert is_one_curve(run_dir) and global_step(run_dir) == goal
+    first, again = attempts(out, "CartPole-v1__ppo__1")
+    assert "--resume" not in first and f"--resume {run_dir}" in again
 
 
 def test_a_run_that_always_fails_is_tried_twice_and_reported_while_the_rest_finishes(grid):
-    out, _, again = grid
-    assert again.returncode == 1
-    assert len(attempts(out, "Brekout__ppo__1")) == len(attempts(out, "Brekout__acppo__1")) == 2
-    reports = [line for line in again.stderr.splitlines() if "Brekout" in line]
-    assert [line.split(": ")[:2] for line in reports] == [
-        ["Brekout__ppo__1", "exit status 2"],
-        ["Brekout__acppo__1", "exit status 2"],
-    ]
-    assert "2 of 4 runs are done" in again.stderr
+    out, _, _, again = grid
+    assert again.returncode == 1 and len(attempts(out, "Brekout__ppo__1")) == 2
+    (report,) = (line for line in again.stderr.splitlines() if "Brekout" in line)
+    assert report.startswith("Brekout__ppo__1: exit status 2: ")
+    assert "1 of 2 runs are done" in again.stderr
 
 
-def test_finished_runs_are_skipped_without_a_trace(grid):
-    out, _, _ = grid
+def test_finished_runs_are_skipped_without_a_trace(grid, call):
+    out = grid[0]
     before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*")}
-    again = call(out, "--games", "CartPole-v1")
-    assert (again.returncode, again.stderr) == (0, f"2 of 2 runs are done, in {out}\n")
+    assert call(*finished(grid)) == (0, "", f"1 of 1 runs are done, in {out}\n")
     assert before == {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*")}
 
 
-def test_with_figures_the_same_command_ends_in_those_of_its_runs(grid):
-    out, _, _ = grid
-    again = call(out, "--games", "CartPole-v1", "--figures")
-    assert (again.returncode, again.stderr) == (0, f"2 of 2 runs are done, in {out}\n")
-    assert len(list((out / "figures").glob("*.png"))) == len(list((out / "figures").glob("*.svg"))) == 5
-    assert "2 runs (variants acppo, ppo; games CartPole-v1; seeds 1), at 100 %" in (out / "tables.md").read_text()
+def test_with_figures_it_ends_in_those_of_its_runs_whatever_the_locale_and_matplotlib_s_backend(
+    grid, call, monkeypatch
+):
+    for name, value in (("LC_ALL", "C"), ("PYTHONUTF8", "0"), ("PYTHONCOERCECLOCALE", "0"), ("MPLBACKEND", "none")):
+        monkeypatch.setenv(name, value)
+    out = grid[0]
+    status, _, said = call(*finished(grid), "--figures")
+    assert (status, said) == (0, f"1 of 1 runs are done, in {out}\n")
+    made = out / "figures" / "beginnings"
+    assert len(list(made.iterdir())) == len(list(made.glob("*.png"))) + len(list(made.glob("*.svg"))) == 10
+    results = (out / "README.md").read_text(encoding="utf-8")
+    assert "2 runs (variants acppo, ppo; games CartPole-v1; seeds 1)" in results and "All in float32." in results
 
 
 def test_a_run_that_another_call_is_training_is_left_to_it(tmp_path, monkeypatch):
@@ -153,15 +195,16 @@ def test_a_run_that_another_call_is_training_is_left_to_it(tmp_path, monkeypatch
     assert run.log(args).read_text() == ""
 
 
-def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid):
-    out, _, _ = grid
-    other = call(out, "--games", "CartPole-v1", "--total-timesteps", str(2 * TOTAL), "--dry-run")
-    assert other.returncode == 1 and other.stdout.count(f"--total-timesteps {TOTAL}, not with {2 * TOTAL}") == 2
+def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid, call):
+    out = grid[0]
+    flags = ("--games", "CartPole-v1", "--total-timesteps", str(2 * ENDLESS), "--dry-run")
+    status, said, _ = call(*GRID, "--out", str(out), *flags)
+    assert status == 1 and said.count(f"--total-timesteps {ENDLESS}, not with {2 * ENDLESS}") == 2
     for variant, difference in (("ppo", "--clip-coef 0.1, not with 0.16"), ("acppo", "--c 1.0, not with None")):
         run_dir = run_dirs(out)[f"CartPole-v1__{variant}__1"]
         renamed = run_dir.rename(run_dir.with_name(run_dir.name.replace(variant, "ppo-wide")))
         wide = Run("CartPole-v1", "ppo-wide", 1)
-        wide.look(Args(out=out, total_timesteps=TOTAL))
+        wide.look(Args(out=out, total_timesteps=ENDLESS))
         renamed.rename(run_dir)
         assert wide.state == "failed" and difference in wide.reason
 
@@ -169,23 +212,30 @@ def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid):
 @pytest.mark.slow
 def test_a_grid_in_the_background_of_a_script_ends_on_sigterm(tmp_path):
     """There, as after `nohup … &`, SIGINT is ignored by all that the shell starts."""
-    ignoring = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_IGN)}
-    driver = start(tmp_path, "--games", "CartPole-v1", "--total-timesteps", str(1000 * TOTAL), **ignoring)
+    driver = start(tmp_path, "--games", "CartPole-v1", sigint=signal.SIG_IGN)
     wait_for(lambda: both_log(tmp_path))
     driver.terminate()
-    assert driver.wait(timeout=60) == 130 and not processes(tmp_path)
-    assert all(steps(path)[-1] == global_step(path) > 0 for path in run_dirs(tmp_path).values())
+    assert driver.wait(timeout=GUARD) == 130 and not processes(tmp_path)
+    assert all(is_one_curve(path) for path in run_dirs(tmp_path).values())
 
 
 # ------------------------------------------------------------------------------------------------------- without Ray
-def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path):
-    flags = ("--games", "Phoenix", "Qbert", "--seeds", "1", "2", "2", "--stop-at", "5000", "--dry-run")
-    dry = call(tmp_path / "out", *flags)
-    assert (dry.returncode, dry.stderr) == (0, "") and not (tmp_path / "out").exists()
-    names = [line.split(":")[0] for line in dry.stdout.splitlines()]
+def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path, call):
+    flags = ["--games", "Phoenix", "Qbert", "--seeds", "1", "2", "2", "--stop-at", "5000", "--bf16", "--dry-run"]
+    status, printed, said = call(*flags, "--total-timesteps", "9000", "--out", str(tmp_path / "out"))
+    assert (status, said) == (0, "") and not (tmp_path / "out").exists()
+    names = [line.split(":")[0] for line in printed.splitlines()]
     assert names == [f"{g}__{v}__{s}" for s in (1, 2) for g in ("Phoenix", "Qbert") for v in ("ppo", "acppo")]
-    assert "acppo_atari.py --clip-coef 0.16 --c 1.0 --env-id Phoenix --seed 1" in dry.stdout.splitlines()[1]
-    assert dry.stdout.count(f"--total-timesteps {TOTAL} --threads 1 --stop-at 5000") == 8
+    assert "acppo_atari.py --clip-coef 0.16 --c 1.0 --env-id Phoenix --seed 1" in printed.splitlines()[1]
+    assert printed.count("--total-timesteps 9000 --threads 1 --stop-at 5000 --bf16") == 8
+
+
+def test_a_run_goes_on_with_the_arithmetic_that_it_began_with(tmp_path):
+    run, args = Run("Qbert", "ppo", 1), Args(out=tmp_path, bf16=True)
+    assert "--bf16" in run.command(args) and "--bf16" not in run.command(Args(out=tmp_path))
+    (tmp_path / "runs" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
+    (tmp_path / "runs" / "Qbert__ppo__1__1700000000" / "checkpoint.pt").touch()
+    assert "--resume" in run.command(args) and "--bf16" not in run.command(args)
 
 
 @pytest.mark.parametrize(
@@ -197,6 +247,9 @@ def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path):
         ["--seeds", "-1"],
         ["--total-timesteps", "0"],
         ["--stop-at", "-5"],
+        ["--cores", "0"],
+        ["--cores", "2", "--address", "auto"],
+        ["--cpus-per-run", "3", "--cores", "2"],
         ["--cpus-per-run", "10000"],
         ["--out", "/proc/nothing"],
         ["--out", "/dev/null"],
@@ -206,32 +259,22 @@ def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path):
     ],
     ids=" ".join,
 )
-def test_what_cannot_work_is_refused_in_one_line(flags, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["atari5.py", *flags])
-    with pytest.raises(SystemExit) as ended:
-        atari5.main()
-    assert ended.value.code == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and said.startswith(flags[0])
+def test_what_cannot_work_is_refused_in_one_line(flags, call):
+    status, _, said = call(*flags)
+    assert status == 2 and said.count("\n") == 1 and said.startswith(flags[0])
 
 
 @pytest.mark.parametrize(
     "flags", [["--games", "Qbert", "Pong"], ["--total-timesteps", "20480"], ["--games", "Pong-v5"]]
 )
-def test_another_grid_than_the_thesis_s_takes_a_directory_of_its_own(flags, capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["atari5.py", *flags])
-    with pytest.raises(SystemExit) as ended:
-        atari5.main()
-    said = capsys.readouterr().err
-    assert ended.value.code == 2 and said.startswith("--out ") and "the thesis's games and length" in said
+def test_another_grid_than_the_thesis_s_takes_a_directory_of_its_own(flags, call):
+    status, _, said = call(*flags)
+    assert status == 2 and said.startswith("--out ") and "the thesis's games and length" in said
 
 
-def test_a_missing_package_is_named_before_anything_runs(capsys, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["atari5.py"])
+def test_a_missing_package_is_named_before_anything_runs(call, monkeypatch):
     monkeypatch.setattr(atari5.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(SystemExit) as ended:
-        atari5.main()
-    assert (ended.value.code, capsys.readouterr().err) == (2, "ray: is not installed; pip install -e '.[benchmark]'\n")
+    assert call() == (2, "", "ray: is not installed; pip install -e '.[benchmark]'\n")
 
 
 def test_an_interrupted_directory_without_a_checkpoint_does_not_count(tmp_path):
@@ -263,16 +306,16 @@ def test_the_table_shows_percent_score_and_time_left_from_the_logs(tmp_path):
 
 
 # ------------------------------------------------------------------------------------ workers and nodes that are killed
-def finish(driver: subprocess.Popen, out: Path) -> list[str]:
-    """Waits for the grid's end, checks every run, and returns the names of those that were started twice."""
-    while driver.poll() is None:
+def wait_for_second_start(out: Path, name: str) -> Path:
+    """Waits until a second process of a run has finished an iteration; returns the run's directory."""
+
+    def logs_again() -> bool:
         assert all(len(found) == 1 for found in processes(out).values())  # none twice at once
-        time.sleep(0.05)
-    assert driver.returncode == 0, driver.communicate()
-    runs = run_dirs(out)
-    for run_dir in runs.values():
-        assert steps(run_dir) == list(range(1024, TOTAL + 1, 1024))
-    return [name for name in runs if len(attempts(out, name)) == 2]
+        files = sorted(run_dirs(out)[name].glob("events.*"), key=os.path.getmtime)
+        return len(files) == 2 and has_logged(files[1])
+
+    wait_for(logs_again)
+    return run_dirs(out)[name]
 
 
 def resumed_at(run_dir: Path) -> int:
@@ -283,16 +326,19 @@ def resumed_at(run_dir: Path) -> int:
 
 @pytest.mark.slow
 def test_a_run_whose_worker_is_killed_writes_its_checkpoint_and_goes_on_from_there(tmp_path):
-    driver = start(tmp_path, "--games", "CartPole-v1", "--total-timesteps", str(TOTAL))
+    driver, name = start(tmp_path, "--games", "CartPole-v1"), "CartPole-v1__ppo__1"
     wait_for(lambda: both_log(tmp_path))
-    child = processes(tmp_path)["CartPole-v1__ppo__1"][0]
+    child = processes(tmp_path)[name][0]
     worker = int(Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()[1])
-    reached = steps(run_dirs(tmp_path)["CartPole-v1__ppo__1"])[-1]
+    reached = steps(run_dirs(tmp_path)[name])[-1]
     os.kill(worker, signal.SIGKILL)
-    assert finish(driver, tmp_path) == ["CartPole-v1__ppo__1"]
-    resumed = resumed_at(run_dirs(tmp_path)["CartPole-v1__ppo__1"])
+    run_dir = wait_for_second_start(tmp_path, name)
+    status, _ = interrupt(driver)
+    resumed = resumed_at(run_dir)
     print(f"its worker was killed when it was at step {reached}; it went on from step {resumed}")
-    assert resumed >= reached
+    assert status == 130 and resumed >= reached
+    assert all(map(is_one_curve, run_dirs(tmp_path).values()))
+    assert len(attempts(tmp_path, name)) == 2 and len(attempts(tmp_path, "CartPole-v1__acppo__1")) == 1
 
 
 @pytest.mark.slow
@@ -302,20 +348,23 @@ def test_a_killed_node_costs_time_and_nothing_else(tmp_path):
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1})
     try:
         node = cluster.add_node(num_cpus=1)
-        flags = ("--games", "CartPole-v1", "--seeds", "1", "2", "--total-timesteps", str(TOTAL))
-        driver = start(tmp_path, *flags, "--address", cluster.address)
+        driver = start(tmp_path, "--games", "CartPole-v1", "--address", cluster.address)
         wait_for(lambda: both_log(tmp_path))
-        reached = {name: steps(path)[-1] for name, path in run_dirs(tmp_path).items()}
+        before = {name: pids[0] for name, pids in processes(tmp_path).items()}
         killed = time.time()
         cluster.remove_node(node, allow_graceful=False)
-        again = finish(driver, tmp_path)
+        # Its run has to wait for another node, for the head's core is taken and no run ends
+        wait_for(lambda: len(processes(tmp_path)) == 1)
+        (lost,) = before.keys() - processes(tmp_path).keys()
+        cluster.add_node(num_cpus=1)
+        run_dir = wait_for_second_start(tmp_path, lost)
+        status, said = interrupt(driver)
     finally:
         cluster.shutdown()
-    assert len(run_dirs(tmp_path)) == 4 and len(again) == 1
-    run_dir = run_dirs(tmp_path)[again[0]]
+    assert status == 130, said
+    assert all(map(is_one_curve, run_dirs(tmp_path).values()))
     waited = max(int(path.name.split(".")[3]) for path in run_dir.glob("events.*")) - killed
-    print(f"{again[0]} was at step {reached[again[0]]} when its node was killed.", end=" ")
-    print(f"After {waited:.0f} s it went on from step {resumed_at(run_dir)} on the other node.")
+    print(f"After {waited:.0f} s {lost} went on from step {resumed_at(run_dir)} on another node.")
 
 
 # ------------------------------------------------------------------------------------- what is taken for a run's own

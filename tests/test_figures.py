@@ -1,9 +1,10 @@
-"""The figures and tables: what is read from the logs, what is made of it, and what a call may touch."""
+"""The results: what is read from the logs, what is made of it, and what a call may touch."""
 
 import itertools
 import json
 import math
 import shutil
+import subprocess
 import sys
 
 import numpy as np
@@ -12,23 +13,23 @@ import pytest
 from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
-from benchmark import figures
+from benchmark import claims, collect, figures, readme
 from conftest import ROOT
 
 BATCH = 1024  # agent steps of an iteration
 
 
-def make_arguments(variant: str, game: str, seed: int) -> dict:
+def make_arguments(variant: str, game: str, seed: int, iterations: int = 10, **more) -> dict:
     epsilon = {"clip_coef": 0.16, "c": 1.0} if variant == "acppo" else {"clip_coef": 0.1}
-    sizes = {"total_timesteps": 10 * BATCH, "num_envs": 8, "num_steps": 128}
-    return {"exp_name": variant, "env_id": game, "seed": seed, **sizes, **epsilon}
+    sizes = {"total_timesteps": iterations * BATCH, "num_envs": 8, "num_steps": 128}
+    return {"exp_name": variant, "env_id": game, "seed": seed, **sizes, **epsilon, **more}
 
 
 def make_run(out, variant="ppo", game="CartPole-v1", seed=1, started=1, **columns):
     """Makes a run's directory as a script does: an event file with `columns`, a value an iteration, and args.json."""
     directory = out / "runs" / f"{game}__{variant}__{seed}__{started}"
     directory.mkdir(parents=True)
-    log(directory, {figures.TAGS[column]: dict(enumerate(values, start=1)) for column, values in columns.items()})
+    log(directory, {collect.TAGS[column]: dict(enumerate(values, start=1)) for column, values in columns.items()})
     provenance = {"commit": "abc", "python": "3.12", "torch": "2.13.0", "machine": "a machine", "threads": 1}
     record = {"command": "ppo_atari.py", "args": make_arguments(variant, game, seed), "provenance": provenance}
     (directory / "args.json").write_text(json.dumps(record))
@@ -44,37 +45,47 @@ def log(directory, points: dict[str, dict[int, float]], suffix: str = "", time: 
     writer.close()
 
 
-def make_csvs(out, runs: dict[tuple, dict]) -> figures.Curves:
-    """Writes the two CSVs: (variant, game, seed) → column → a value an iteration; what is not given is 0.1."""
+def make_csvs(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=()) -> None:
+    """Writes the two CSVs: (variant, game, seed) → column → a value an iteration; what is not given is 0.1.
+
+    Their schedule has as many iterations as the longest of them, or as `iterations` says.
+    """
     rows, curves = [], []
     for (variant, game, seed), columns in runs.items():
         curve = pd.DataFrame({"games_ended": 100, **columns})
-        curve = curve.reindex(columns=["games_ended", *figures.TAGS], fill_value=0.1)
+        curve = curve.reindex(columns=["games_ended", *collect.TAGS], fill_value=0.1)
         curve["step"] = BATCH * np.arange(1, len(curve) + 1)
-        key = {"variant": variant, "game": game, "seed": seed}
-        curves.append(curve.assign(**key))
-        arguments = json.dumps(make_arguments(variant, game, seed))
+        curves.append(curve.assign(variant=variant, game=game, seed=seed))
+    total = iterations or max(map(len, curves))
+    for key, curve in zip(runs, curves):
+        arguments = make_arguments(*key, total, bf16=key in bf16)
         place = {"commit": "abc", "machine": "a machine", "threads": "1", "versions": "{}", "command": "ppo_atari.py"}
-        rows.append({**key, **place, "steps": curve.step.max(), "total_timesteps": 10 * BATCH, "arguments": arguments})
+        row = {**dict(zip(collect.KEY, key)), **place, "steps": curve.step.max()}
+        rows.append({**row, "total_timesteps": total * BATCH, "arguments": json.dumps(arguments)})
     out.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(rows)[figures.RUN_COLUMNS].to_csv(out / "runs.csv", index=False)
-    pd.concat(curves)[figures.CURVE_COLUMNS].to_csv(out / "curves.csv", index=False)
-    return figures.by_run(figures.read_csvs(out)[1])
+    pd.DataFrame(rows).reindex(columns=collect.RUN_COLUMNS).to_csv(out / "runs.csv", index=False)
+    pd.concat(curves)[collect.CURVE_COLUMNS].to_csv(out / "curves.csv", index=False)
 
 
-def make_pairs(out, differences: dict[str, list[float]], **acppo) -> figures.Curves:
-    """Writes CSVs of a pair for each final difference of scores, by game."""
+def make_stages(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=()) -> list[claims.Stage]:
+    make_csvs(out, runs, iterations, bf16)
+    return claims.make_stages(*collect.read_csvs(out))
+
+
+def make_pairs(out, differences: dict[str, list[float]], iterations: int = 2, **acppo) -> claims.Stage:
+    """Returns the one stage of a pair for each final difference of scores, by game."""
     runs = {}
     for game, of_game in differences.items():
         for seed, difference in enumerate(of_game, start=1):
             runs["ppo", game, seed] = {"mean_return_100": [0, 10]}
             runs["acppo", game, seed] = {"mean_return_100": [0, 10 + difference], **acppo}
-    return make_csvs(out, runs)
+    (stage,) = make_stages(out, runs, iterations)
+    return stage
 
 
-def call(monkeypatch, *flags) -> None:
+def call(monkeypatch, *flags, command=figures) -> None:
     monkeypatch.setattr(sys, "argv", ["figures.py", *map(str, flags)])
-    figures.main()
+    command.main()
 
 
 def contents(directory) -> dict[str, bytes]:
@@ -89,7 +100,7 @@ def cells(markdown: str) -> list[list[str]]:
 # ----------------------------------------------------------------------------------------------------- collect
 def test_all_of_20000_points_are_read(tmp_path):
     directory = make_run(tmp_path, kl=range(20_000))
-    curve = figures.read_curve(figures.read_events(directory))
+    curve = collect.read_curve(collect.read_events(directory))
     assert list(curve.index) == [BATCH * i for i in range(1, 20_001)]
     assert list(curve.kl) == list(range(20_000))
 
@@ -99,22 +110,23 @@ def test_a_step_that_was_logged_twice_keeps_what_was_written_last(tmp_path):
     log(directory, {"losses/kl": {3: 30, 4: 40, 5: 50}, "losses/clipfrac": {5: 0.5}}, suffix=".resumed")
     log(directory, {"losses/kl": {1: -1}}, suffix=".the-last-name-but-the-first-to-be-written", time=1.0)
     log(directory, {"losses/kl": {5: 55}}, suffix=".again")
-    curve = figures.read_curve(figures.read_events(directory))
+    curve = collect.read_curve(collect.read_events(directory))
     assert list(curve.kl) == [1, 2, 30, 40, 55]
     assert curve.clipfrac.iloc[-1] == 0.5 and curve.clipfrac[:-1].isna().all()
 
 
 def test_a_run_gives_a_row_and_its_iterations_with_six_digits(tmp_path):
     make_run(tmp_path, "acppo", seed=7, kl=[1 / 3, 1e-5 / 3], mean_return_100=[9, 10])
-    figures.collect(tmp_path)
+    collect.collect(tmp_path)
     run = pd.read_csv(tmp_path / "runs.csv").iloc[0]
     assert (run.variant, run.game, run.seed, run.steps, run.total_timesteps) == ("acppo", "CartPole-v1", 7, 2048, 10240)
     assert (run.commit, run.machine, run.threads) == ("abc", "a machine", 1)
     assert json.loads(run.versions) == {"python": "3.12", "torch": "2.13.0"}
     assert json.loads(run.arguments) == make_arguments("acppo", "CartPole-v1", 7)
     lines = (tmp_path / "curves.csv").read_text().splitlines()
-    expected = ["acppo,CartPole-v1,7,1024,9,0.333333,,,,,,,0", "acppo,CartPole-v1,7,2048,10,3.33333e-06,,,,,,,0"]
-    assert lines[1:] == expected
+    nothing = "," * (len(collect.CURVE_COLUMNS) - 6)
+    assert lines[0].startswith("variant,game,seed,step,mean_return_100,kl,") and lines[0].endswith(",games_ended")
+    assert lines[1:] == [f"acppo,CartPole-v1,7,{row}{nothing}0" for row in ("1024,9,0.333333", "2048,10,3.33333e-06")]
 
 
 def test_games_are_counted_where_they_ended_and_starts_where_they_differ(tmp_path):
@@ -125,53 +137,53 @@ def test_games_are_counted_where_they_ended_and_starts_where_they_differ(tmp_pat
     for commit, machine in (("abc", "one"), ("def", "one"), ("abc", "other")):
         writer.add_text("provenance", f"|name|value|\n|-|-|\n|commit|{commit}|\n|machine|{machine}|")
     writer.close()
-    figures.collect(tmp_path)
-    runs, curves = figures.read_csvs(tmp_path)
+    collect.collect(tmp_path)
+    runs, curves = collect.read_csvs(tmp_path)
     assert list(curves.games_ended) == [2, 4, 5]
     assert (runs.commit[0], runs.machine[0], runs.threads[0]) == ("abc; def", "one; other", "unknown")
 
 
-def test_runs_without_a_directory_keep_their_rows_and_found_ones_replace_theirs(tmp_path, capsys):
+def test_runs_without_a_directory_keep_their_rows_and_found_ones_replace_theirs(tmp_path, capfd):
     first = make_run(tmp_path, seed=1, kl=[1, 2])
     make_run(tmp_path, seed=2, kl=[3])
-    figures.collect(tmp_path)
+    collect.collect(tmp_path)
     shutil.rmtree(first)
     log(tmp_path / "runs" / "CartPole-v1__ppo__2__1", {"losses/kl": {2: 4}}, suffix=".more")
     make_run(tmp_path, "acppo", kl=[5])
-    figures.collect(tmp_path)
-    assert capsys.readouterr().err == ""
-    runs, curves = figures.read_csvs(tmp_path)
+    collect.collect(tmp_path)
+    assert capfd.readouterr().err == ""
+    runs, curves = collect.read_csvs(tmp_path)
     assert list(zip(runs.variant, runs.seed, runs.steps)) == [("acppo", 1, 1024), ("ppo", 1, 2048), ("ppo", 2, 2048)]
     assert list(curves.kl) == [5, 1, 2, 3, 4]
     before = contents(tmp_path)
-    figures.collect(tmp_path)
+    collect.collect(tmp_path)
     assert contents(tmp_path) == before
     make_run(tmp_path, seed=1, kl=[6])
-    figures.collect(tmp_path)
-    assert list(figures.read_csvs(tmp_path)[1].kl) == [5, 6, 3, 4]
-    assert capsys.readouterr().err == "ppo CartPole-v1 1: 1024 steps replace 2048\n"
+    collect.collect(tmp_path)
+    assert list(collect.read_csvs(tmp_path)[1].kl) == [5, 6, 3, 4]
+    assert capfd.readouterr().err == "ppo CartPole-v1 1: 1024 steps replace 2048\n"
 
 
-def test_of_two_directories_of_a_run_the_one_that_got_further_counts(tmp_path, capsys):
+def test_of_two_directories_of_a_run_the_one_that_got_further_counts(tmp_path, capfd):
     make_run(tmp_path, started=1, kl=[1, 1, 1])
     make_run(tmp_path, started=2, kl=[2, 2])
-    figures.collect(tmp_path)
-    assert list(figures.read_csvs(tmp_path)[1].kl) == [1, 1, 1]
+    collect.collect(tmp_path)
+    assert list(collect.read_csvs(tmp_path)[1].kl) == [1, 1, 1]
     assert (
-        capsys.readouterr().err
+        capfd.readouterr().err
         == "ppo CartPole-v1 1: CartPole-v1__ppo__1__1 counts, CartPole-v1__ppo__1__2 got no further\n"
     )
 
 
-def test_a_directory_that_is_no_run_is_left_out_and_said(tmp_path, capsys):
+def test_a_directory_that_is_no_run_is_left_out_and_said(tmp_path, capfd):
     make_run(tmp_path, kl=[1])
     (make_run(tmp_path, seed=2, kl=[1]) / "args.json").write_text("{")
     (make_run(tmp_path, seed=3, kl=[1]) / "args.json").unlink()
     make_run(tmp_path, seed=4)
     (make_run(tmp_path, seed=5, kl=[1]) / "args.json").write_text("[]")
-    figures.collect(tmp_path)
-    assert list(figures.read_csvs(tmp_path)[0].seed) == [1]
-    said = capsys.readouterr().err.splitlines()
+    collect.collect(tmp_path)
+    assert list(collect.read_csvs(tmp_path)[0].seed) == [1]
+    said = capfd.readouterr().err.splitlines()
     assert len(said) == 4 and all("left out" in line for line in said)
 
 
@@ -181,54 +193,70 @@ def test_a_directory_that_is_no_run_is_left_out_and_said(tmp_path, capsys):
     [([5], 5), ([1, 2], 1.5), ([100, 0, 1, 2], 1.5), ([0, 1, 2, 5, 100], (0.75 * 1 + 2 + 0.75 * 5) / 2.5)],
 )
 def test_the_interquartile_mean_weighs_borders_by_their_part_inside(values, mean):
-    assert figures.interquartile_mean(np.array(values, dtype=float)) == pytest.approx(mean)
+    assert claims.interquartile_mean(np.array(values, dtype=float)) == pytest.approx(mean)
 
 
 def test_the_interval_is_that_of_all_ways_to_redraw_seeds_within_games():
     strata = [np.array([0.1, 0.5, 0.4]), np.array([1.0, 3.0, 1.7])]
     ways = [list(itertools.product(values, repeat=3)) for values in strata]  # 27 × 27, equally likely
-    means = [figures.interquartile_mean(np.array(one + other)) for one, other in itertools.product(*ways)]
-    low, high = figures.bootstrap_interval(strata)
+    means = [claims.interquartile_mean(np.array(one + other)) for one, other in itertools.product(*ways)]
+    low, high = claims.bootstrap_interval(strata)
     assert np.mean(np.less(means, low - 1e-9)) < 0.03 and np.mean(np.less(means, low + 1e-9)) > 0.02
     assert np.mean(np.greater(means, high + 1e-9)) < 0.03 and np.mean(np.greater(means, high - 1e-9)) > 0.02
-    assert (low, high) == figures.bootstrap_interval(strata)
+    assert (low, high) == claims.bootstrap_interval(strata)
     # Across games 0 and 10 would mix; within a game there is nothing to mix
-    assert figures.bootstrap_interval([np.zeros(3), np.full(3, 10.0)]) == (5, 5)
-    assert figures.bootstrap_interval([np.zeros(3), np.zeros(1)]) is None
+    assert claims.bootstrap_interval([np.zeros(3), np.full(3, 10.0)]) == (5, 5)
+    assert claims.bootstrap_interval([np.zeros(3), np.zeros(1)]) is None
 
 
 def test_the_interval_of_three_pairs_a_game_excludes_no_difference_one_time_in_ten(monkeypatch):
     """For two equal algorithms a 95 % interval should do so one time in twenty; the text beside the claims says ten."""
-    monkeypatch.setattr(figures, "DRAWS", 1000)
+    monkeypatch.setattr(claims, "DRAWS", 1000)
     generator = np.random.default_rng(1)
-    intervals = [figures.bootstrap_interval(list(generator.standard_normal((5, 3)))) for _ in range(1000)]
+    intervals = [claims.bootstrap_interval(list(generator.standard_normal((5, 3)))) for _ in range(1000)]
     assert 0.08 < np.mean([low > 0 or high < 0 for low, high in intervals]) < 0.12
 
 
-def test_runs_of_a_game_are_compared_at_one_step_without_those_shorter_than_half(tmp_path):
-    lengths = {("ppo", "Pong", 1): 10, ("ppo", "Pong", 2): 7, ("ppo", "Pong", 3): 4, ("acppo", "Pong", 1): 5}
-    runs = {key: {"kl": range(length)} for key, length in lengths.items()} | {("ppo", "Qbert", 1): {"kl": range(3)}}
-    curves = make_csvs(tmp_path, runs)
-    compared = figures.comparable(curves)
-    assert {key: list(curve.kl) for key, curve in compared.items()} == {
-        ("ppo", "Pong", 1): [0, 1, 2, 3, 4],
-        ("ppo", "Pong", 2): [0, 1, 2, 3, 4],
-        ("acppo", "Pong", 1): [0, 1, 2, 3, 4],
-        ("ppo", "Qbert", 1): [0, 1, 2],
+def test_finished_runs_are_compared_apart_from_beginnings_each_game_at_one_step(tmp_path):
+    lengths = {("ppo", "Pong", 1): 100, ("acppo", "Pong", 1): 90, ("ppo", "Pong", 2): 89, ("acppo", "Pong", 2): 45}
+    lengths |= {("ppo", "Pong", 3): 44, ("ppo", "Qbert", 1): 3}
+    stages = make_stages(tmp_path, {key: {"kl": range(length)} for key, length in lengths.items()})
+    finished, beginnings = stages
+    assert (finished.name, beginnings.name) == ("finished", "beginnings")
+    ends = {key: len(curve) for stage in stages for key, curve in stage.drawn.items()}
+    assert {key: len(curve) for key, curve in finished.drawn.items()} == {
+        ("ppo", "Pong", 1): 100,
+        ("acppo", "Pong", 1): 90,
     }
-    said = figures.coverage(figures.read_csvs(tmp_path)[0], compared)
-    assert "In the figures alone, being shorter than half of their game's longest run: Pong ppo 3." in said
+    assert {key: list(curve.kl) for key, curve in finished.compared.items()} == dict.fromkeys(
+        [("ppo", "Pong", 1), ("acppo", "Pong", 1)], list(range(90))
+    )
+    # The figures show them as far as the longest unfinished one, a finished one's first steps too
+    assert ends == {**lengths, ("ppo", "Pong", 1): 89, ("acppo", "Pong", 1): 89}
+    without_short = {key: 45 for key in lengths if key[1] == "Pong" and key[2] < 3} | {("ppo", "Qbert", 1): 3}
+    assert {key: len(curve) for key, curve in beginnings.compared.items()} == without_short
+    assert "In the figures alone, being shorter than half of their game's longest: Pong ppo 3." in figures.coverage(
+        beginnings
+    )
+    assert "at 90 % to 100 % of a schedule of 102,400 agent steps. All in float32." in figures.coverage(finished)
+
+
+def test_it_is_said_which_runs_are_in_bfloat16(tmp_path):
+    keys = [("ppo", "Pong", 1), ("acppo", "Pong", 1), ("ppo", "Pong", 2)]
+    (stage,) = make_stages(tmp_path, {key: {"kl": [1]} for key in keys}, bf16=keys[:2])
+    said = "In bfloat16: Pong ppo 1, Pong acppo 1; the others in float32."
+    assert said in figures.coverage(stage) and all(text.endswith(said) for text in figures.captions(stage).values())
 
 
 def test_both_spike_rates_as_counted_by_hand(tmp_path):
     ppo = [1] * 93 + [9] * 2 + [20] * 5  # 99th percentile 20, median 1
     acppo = [1] * 97 + [30] * 3
-    curves = make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}})
-    margins = figures.find_margins(curves)
+    (stage,) = make_stages(tmp_path, {("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}})
+    margins = claims.find_margins(stage.compared)
     assert margins["relative spikes"]["Pong"] == pytest.approx([0 - 0.03])
     assert margins["own spikes"]["Pong"] == pytest.approx([0.05 - 0.03])
     assert margins["KL"]["Pong"] == pytest.approx([math.log(2.11 / 1.87)])
-    ppo_row, acppo_row = cells(figures.kl_table(figures.read_csvs(tmp_path)[0], curves))[2:]
+    ppo_row, acppo_row = cells(claims.kl_table(stage.runs, stage.compared))[2:]
     # The TV distance is 0.1: above PPO's 0.1 / 2, above AC-PPO's 0.16 / 2
     assert ppo_row == ["Pong", "ppo", "1", "102,400", "2.11", "1", "20", "20", "0.00%", "5.00%", "100.00%", "0.1000"]
     assert acppo_row[4:] == ["1.87", "1", "30", "30", "3.00%", "3.00%", "100.00%", "0.1000"]
@@ -236,12 +264,36 @@ def test_both_spike_rates_as_counted_by_hand(tmp_path):
 
 def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have(tmp_path):
     kl = {("ppo", "Pong", 1): [1] * 100, ("ppo", "Pong", 2): [1] * 90 + [9] * 10, ("acppo", "Pong", 1): [1] * 99 + [5]}
-    curves = make_csvs(tmp_path, {key: {"kl": values} for key, values in kl.items()})
-    assert figures.spike_limit(curves, "Pong") == 9
-    assert figures.find_margins(curves)["relative spikes"]["Pong"] == [0]  # a 5 is one for seed 1 alone
-    rows = cells(figures.kl_table(figures.read_csvs(tmp_path)[0], curves))[2:]
+    (stage,) = make_stages(tmp_path, {key: {"kl": values} for key, values in kl.items()})
+    assert claims.spike_limit(stage.compared, "Pong") == 9
+    assert claims.find_margins(stage.compared)["relative spikes"]["Pong"] == [0]  # a 5 is one for seed 1 alone
+    rows = cells(claims.kl_table(stage.runs, stage.compared))[2:]
     assert [row[8:10] for row in rows] == [["0.00%", "0.00%"], ["0.00%", "0.00%"]]  # 5 and 9 are not above ten times 1
     assert rows[0][2:8] == ["2", "102,400", "1.4", "1", "9", "9"]
+
+
+def test_progress_is_told_in_tenths_of_a_run(tmp_path):
+    columns = {"mean_return_100": range(1000, 1020), "kl": [1, 3] * 9 + [4, 6]}
+    (stage,) = make_stages(tmp_path, {("ppo", "Pong", 1): columns})
+    header, _, score, kl = cells(claims.progress_table(stage.compared))
+    assert (header[2], header[-1]) == ("10 %", "100 %")
+    assert score[1:4] == ["score", "1,001", "1,003"] and kl[1:] == ["KL", *["2"] * 9, "5"]
+
+
+def test_the_largest_kls_stand_beside_what_else_their_iteration_had(tmp_path):
+    columns = {"kl": [1, 9, 3, 1, 1], "games_ended": [0, 2, 2, 5, 6], "learning_rate": [0.5, 0.4, 0.3, 0.2, 0.1]}
+    columns["explained_variance"] = [math.nan, math.nan, 0.5, 0.25, 0.75]
+    (stage,) = make_stages(tmp_path, {("ppo", "Pong", 1): columns})
+    header, _, *rows = cells(claims.spikes_table(stage.compared, most=2))
+    named = [dict(zip(header, row)) for row in rows]
+    assert {row["run"] for row in named} == {"Pong ppo 1"}
+    chosen = ("agent step", "KL", "× median", "learning rate", "explained variance", "games ended")
+    assert [[row[name] for name in chosen] for row in named] == [
+        ["2,048", "9", "9", "0.4", "–", "2"],
+        ["3,072", "3", "3", "0.3", "0.5", "0"],
+        ["their rank", "0.9", "0.9", "0.7", "0.667", "0.5"],  # 5 and 4 of 5; 4 and 3; 2 of 3; 3 and 1 of 4
+        ["all: median", "1", "1", "0.3", "0.5", "1.5"],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -257,8 +309,7 @@ def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have(tmp_path):
     ],
 )
 def test_a_claim_holds_on_a_game_where_three_or_more_pairs_all_have_its_sign(differences, judged, tmp_path):
-    curves = make_pairs(tmp_path, {"Pong": differences})
-    header, _, score, *_ = cells(figures.claims_table(curves))
+    header, _, score, *_ = cells(claims.claims_table(make_pairs(tmp_path, {"Pong": differences})))
     assert header == ["claim", "Pong", "across games"]
     assert score == ["AC-PPO's final score is above PPO's", judged, "–"]
 
@@ -274,27 +325,52 @@ def test_a_claim_holds_on_a_game_where_three_or_more_pairs_all_have_its_sign(dif
     ],
 )
 def test_a_claim_is_judged_across_games_by_its_interval(pong, breakout, judged, tmp_path):
-    curves = make_pairs(tmp_path, {"Pong": pong, "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
+    stage = make_pairs(tmp_path, {"Pong": pong, "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
     strata = [np.array(breakout) / (30.5 - 1.7), np.array(pong) / (14.6 + 20.7)]  # CartPole has no human score
-    mean, interval = figures.interquartile_mean(np.concatenate(strata)), figures.bootstrap_interval(strata)
+    mean, interval = claims.interquartile_mean(np.concatenate(strata)), claims.bootstrap_interval(strata)
     shown = "no interval: one seed" if interval is None else "{:+.3f} to {:+.3f}".format(*interval)
-    across = cells(figures.claims_table(curves))[2][-1]
+    across = cells(claims.claims_table(stage))[2][-1]
     assert across == f"{judged}: {mean:+.3f} of human minus random score ({shown})"
 
 
 def test_a_game_without_a_pair_leaves_the_claim_across_games_undecided(tmp_path):
-    make_pairs(tmp_path, {"Pong": [5, 6, 7], "Breakout": [1, 2, 3]})
-    runs, curves = figures.read_csvs(tmp_path)
-    alone = curves[curves.game.eq("Pong") & curves.variant.eq("ppo")].assign(game="Qbert")
-    score = cells(figures.claims_table(figures.by_run(pd.concat([curves, alone]))))[2]
+    stage = make_pairs(tmp_path, {"Pong": [5, 6, 7], "Breakout": [1, 2, 3]})
+    alone = {("ppo", "Qbert", seed): curve for (_, game, seed), curve in stage.compared.items() if game == "Pong"}
+    stage.compared |= alone
+    score = cells(claims.claims_table(stage))[2]
     assert score[1:4] == ["✓ 3 of 3", "✓ 3 of 3", "? 0 of 0"]
     assert score[4].startswith("? cannot be told apart with these runs: +")
 
 
+def test_before_90_percent_of_the_schedule_it_is_too_early_for_a_final_score_and_for_all_that_quotes_it(tmp_path):
+    differences = {"Pong": [5, 6, 7], "Breakout": [1, 2, 3]}
+    finished, early = make_pairs(tmp_path / "a", differences), make_pairs(tmp_path / "b", differences, iterations=3)
+    assert (finished.name, early.name) == ("finished", "beginnings")
+    score, *others = cells(claims.claims_table(early))[2:]
+    assert score[1:] == ["too early"] * 3
+    assert others == cells(claims.claims_table(finished))[3:] and "too early" not in str(others)
+    assert "interquartile" in figures.stage_tables(finished)["score"]
+    assert "interquartile" not in figures.stage_tables(early)["score"]
+    assert [row[-1] for row in cells(claims.short_table([early]))[2:]] == ["too early"] * 2
+    assert [row[-1] for row in cells(claims.short_table([finished]))[2:]] == ["✓ 3 of 3"] * 2
+
+
+def test_the_short_table_has_the_pairs_of_each_game_s_most_advanced_stage(tmp_path):
+    whole = {"mean_return_100": [1, 2, 3], "kl": [0.1, 0.1, 0.4]}
+    part = {"mean_return_100": [1, 7], "kl": [0.1, 0.1]}
+    runs = {("ppo", "Pong", 1): whole, ("acppo", "Pong", 1): {**whole, "kl": [0.1, 0.1, 0.1]}}
+    runs |= {("ppo", "Pong", 2): part, ("acppo", "Pong", 2): part, ("product", "Qbert", 1): part}
+    runs |= {("ppo", "Breakout", 1): part, ("acppo", "Breakout", 1): part, ("ppo", "Breakout", 2): part}
+    assert cells(claims.short_table(make_stages(tmp_path, runs)))[2:] == [
+        ["Breakout", "1", "2,048", "7.0", "7.0", "1.00", "too early"],
+        ["Pong", "1", "3,072", "3.0", "3.0", "2.00", "? 0 of 1, 1 equal"],
+    ]
+
+
 def test_a_clip_ratio_holds_inside_its_band_for_every_run(tmp_path):
     for ratio, judged in ((0.119, "✓ 3 of 3"), (0.121, "✗ 0 of 3"), (0.079, "✗ 0 of 3")):
-        curves = make_pairs(tmp_path, {"Pong": [0, 0, 0]}, avg_clip_ratio=[ratio, ratio])
-        assert cells(figures.claims_table(curves))[-1][1] == judged
+        stage = make_pairs(tmp_path, {"Pong": [0, 0, 0]}, avg_clip_ratio=[ratio, ratio])
+        assert cells(claims.claims_table(stage))[-1][1] == judged
 
 
 # ------------------------------------------------------------------------------------------ tables and figures
@@ -305,7 +381,8 @@ def test_the_score_table_gives_mean_and_sample_deviation_and_says_where_games_ar
         ("acppo", "BattleZone", 1): {"mean_return_100": [0, 12], "games_ended": [8, 100]},
         ("acppo", "CartPole-v1", 1): {"mean_return_100": [math.nan, math.nan], "games_ended": 0},
     }
-    header, _, battle_zone, cartpole = cells(figures.score_table(make_csvs(tmp_path, runs)))
+    (stage,) = make_stages(tmp_path, runs)
+    header, _, battle_zone, cartpole = cells(claims.score_table(stage.compared))
     assert battle_zone[:4] == ["BattleZone", "2,048", "15.0 ± 7.1 (n = 2, 99 games)", "12.0 (n = 1)"]
     ppo2 = header.index("openai/baselines ppo2 (CleanRL docs/benchmark), 10,000,000")
     assert battle_zone[ppo2] == "19,980.0 ± 1,355.2"
@@ -313,8 +390,8 @@ def test_the_score_table_gives_mean_and_sample_deviation_and_says_where_games_ar
 
 
 def test_the_human_normalised_table_says_where_seeds_are_too_few_for_an_interval(tmp_path):
-    curves = make_pairs(tmp_path, {"Pong": [3.53]})  # a tenth of the human range
-    table = cells(figures.human_table(curves))[2:]
+    stage = make_pairs(tmp_path, {"Pong": [3.53]})  # a tenth of the human range
+    table = cells(claims.human_table(stage.compared))[2:]
     assert table[0] == ["ppo", "1", "1", f"{(10 + 20.7) / 35.3:.3f}", "no interval: one seed"]
     assert table[2] == ["acppo − ppo, by pairs", "1", "1", "0.100", "no interval: one seed"]
 
@@ -322,100 +399,32 @@ def test_the_human_normalised_table_says_where_seeds_are_too_few_for_an_interval
 @pytest.mark.parametrize(("game", "frames"), [("BattleZone", 4), ("ALE/Pong-v5", 4), ("CartPole-v1", 1)])
 def test_the_horizontal_axis_counts_frames_on_atari_alone(game, frames, tmp_path):
     axis = Figure().subplots()
-    curves = make_csvs(tmp_path, {("ppo", game, 1): {"mean_return_100": [1, 2, 3]}})
-    figures.draw_panel(axis, curves, game, "mean_return_100")
+    (stage,) = make_stages(tmp_path, {("ppo", game, 1): {"mean_return_100": [1, 2, 3]}})
+    figures.draw_panel(axis, stage.drawn, game, "mean_return_100")
     assert list(axis.lines[-1].get_xdata()) == [frames * BATCH * i for i in (1, 2, 3)]
     assert list(axis.lines[-1].get_ydata()) == [1, 2, 3]
 
 
 def test_mean_and_band_are_over_seeds_as_far_as_all_have_got(tmp_path):
-    axis = Figure().subplots()
-    scores = {1: [1, 2, 3], 2: [3, 6]}
-    curves = make_csvs(tmp_path, {("ppo", "Pong", seed): {"mean_return_100": of} for seed, of in scores.items()})
-    figures.draw_panel(axis, curves, "Pong", "mean_return_100")
+    def draw(column: str, of_seeds: list) -> Figure:
+        runs = {("ppo", "Pong", seed): {column: values} for seed, values in enumerate(of_seeds, start=1)}
+        (stage,) = make_stages(tmp_path, runs, iterations=1000)
+        axis = Figure().subplots()
+        figures.draw_panel(axis, stage.drawn, "Pong", column)
+        return axis
+
+    axis = draw("mean_return_100", [[1, 2, 3], [3, 6]])
     np.testing.assert_equal(axis.lines[-1].get_ydata(), [2, 4, math.nan])
-    kl = Figure().subplots()
-    figures.draw_panel(
-        kl,
-        make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": range(1, 61)}, ("ppo", "Pong", 2): {"kl": range(1, 41)}}),
-        "Pong",
-        "kl",
-    )
-    drawn = kl.lines[-1].get_ydata()
-    assert np.isfinite(drawn[:40]).all() and np.isnan(drawn[40:]).all()
     band = axis.collections[0].get_paths()[0].vertices
     assert band[:, 1].min() == pytest.approx(2 - math.sqrt(2)) and band[:, 1].max() == pytest.approx(4 + math.sqrt(8))
-
-
-def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_path, monkeypatch):
-    """The default grid writes the README beside it, another grid neither that nor anything of the default grid."""
-    monkeypatch.setattr(figures, "ROOT", tmp_path)
-    monkeypatch.setattr(figures, "DEFAULT_OUT", default := tmp_path / "benchmark" / "results")
-    (tmp_path / "README.md").write_text("before\n<!-- results -->\nold\n<!-- end results -->\nafter\n")
-    scores = {"mean_return_100": [1, 2], "kl": [0.1, 0.2]}
-    for variant in ("ppo", "acppo", "of my own"):
-        make_run(default, variant, **scores)
-        make_run(tmp_path / "other", variant, "Pong", **scores)
-    call(monkeypatch, "--out", default)
-    made = contents(default)
-    for name in figures.FIGURES:
-        assert made[f"figures/{name}.png"].startswith(b"\x89PNG") and len(made[f"figures/{name}.png"]) > 10_000
-        assert b"</svg>" in made[f"figures/{name}.svg"]
-    assert made["tables.md"].decode() == figures.tables_text(default)
-    section = figures.results_section(default, tmp_path / "README.md")
-    assert "](benchmark/results/figures/score.png)" in section
-    readme = (tmp_path / "README.md").read_text()
-    assert readme == f"before\n<!-- results -->\n{section}<!-- end results -->\nafter\n"
-
-    call(monkeypatch, "--out", tmp_path / "other")
-    assert (tmp_path / "other" / "figures" / "kl.svg").exists()
-    assert contents(default) == made and (tmp_path / "README.md").read_text() == readme
-    shutil.rmtree(default / "runs")  # from the CSVs alone
-    call(monkeypatch, "--out", default)
-    assert contents(default) == {name: data for name, data in made.items() if not name.startswith("runs/")}
-    assert (tmp_path / "README.md").read_text() == readme
-
-
-@pytest.mark.parametrize(
-    ("flags", "said"),
-    [
-        (["--out", "nowhere"], "has neither runs nor their CSVs"),
-        (["--out", "empty"], "no run there has an iteration"),
-        (["--out", "foreign"], "has other columns"),
-        (["--out", "damaged"], "cannot be read"),
-        (["--out", "empty", "--readme", "plain.md"], "to write between"),
-        (["--out", "empty", "--readme", "nowhere.md"], "to write between"),
-    ],
-)
-def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "empty" / "runs").mkdir(parents=True)
-    for name, text in (("foreign", "a,b\n1,2\n"), ("damaged", ",".join(figures.RUN_COLUMNS) + "\nx,y,no number\n")):
-        (tmp_path / name).mkdir()
-        for file in ("runs.csv", "curves.csv"):
-            (tmp_path / name / file).write_text(text)
-    (tmp_path / "plain.md").write_text("<!-- end results --> <!-- results -->")
-    with pytest.raises(SystemExit) as exit_:
-        call(monkeypatch, *flags)
-    out, err = capsys.readouterr()
-    assert exit_.value.code == 2 and out == "" and err.count("\n") == 1 and said in err
-
-
-def test_the_results_in_the_repository_are_those_of_its_csvs():
-    parts = figures.split_readme(ROOT / "README.md")
-    assert parts is not None, "the README has lost the place of its results"
-    readme, section = (ROOT / "README.md").read_text(), figures.results_section(figures.DEFAULT_OUT)
-    assert readme == f"{figures.MARKERS[0]}\n{section}{figures.MARKERS[1]}".join(parts), "run benchmark/figures.py"
-    assert (figures.DEFAULT_OUT / "tables.md").read_text() == figures.tables_text(figures.DEFAULT_OUT)
+    drawn = draw("kl", [range(1, 61), range(1, 41)]).lines[-1].get_ydata()
+    assert np.isfinite(drawn[:40]).all() and np.isnan(drawn[40:]).all()
 
 
 def test_a_figure_says_game_seeds_units_and_bounds(tmp_path):
     keys = [("ppo", "BattleZone", 1), ("ppo", "BattleZone", 2), ("acppo", "BattleZone", 1), ("ppo", "CartPole-v1", 1)]
-    curves = make_csvs(tmp_path, {key: {"kl": [0.1, 0.2, 0.1]} for key in keys})
-    runs = figures.read_csvs(tmp_path)[0]
-    drawn = {
-        name: figures.draw_figure(name, text, runs, curves) for name, text in figures.captions(runs, curves).items()
-    }
+    (stage,) = make_stages(tmp_path, {key: {"kl": [0.1, 0.2, 0.1]} for key in keys})
+    drawn = {name: figures.draw_figure(name, stage) for name in figures.FIGURES}
     for name, figure in drawn.items():
         titles = [axis.get_title() for axis in figure.axes if axis.axison]
         assert set(titles) == {"BattleZone\n(n = 2 ppo, 1 acppo)", "CartPole-v1 (n = 1)"}
@@ -432,4 +441,94 @@ def test_a_figure_says_game_seeds_units_and_bounds(tmp_path):
 def test_a_pair_has_one_seed_and_a_seed_without_a_partner_is_in_none(tmp_path):
     runs = {("ppo", "Pong", seed): {"mean_return_100": [score]} for seed, score in ((1, 10), (2, 20), (3, 30))}
     runs |= {("acppo", "Pong", seed): {"mean_return_100": [score]} for seed, score in ((2, 21), (3, 32), (4, 40))}
-    assert list(figures.find_margins(make_csvs(tmp_path, runs))["score"]["Pong"]) == [1, 2]
+    (stage,) = make_stages(tmp_path, runs)
+    assert list(claims.find_margins(stage.compared)["score"]["Pong"]) == [1, 2]
+
+
+# ------------------------------------------------------------------------------------------------- whole calls
+@pytest.fixture
+def two_figures(monkeypatch):
+    """Has fewer figures drawn, which takes most of a call's time."""
+    monkeypatch.setattr(figures, "FIGURES", {name: figures.FIGURES[name] for name in ("score", "kl")})
+
+
+def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_path, monkeypatch, two_figures):
+    """The default grid writes the README beside it, another grid neither that nor anything of the default grid."""
+    monkeypatch.setattr(figures, "ROOT", tmp_path)
+    monkeypatch.setattr(figures, "DEFAULT_OUT", default := tmp_path / "benchmark" / "results")
+    default.mkdir(parents=True)
+    marks = "before é\n<!-- results -->\nold\n<!-- end results -->\nafter\n"
+    for path in (tmp_path / "README.md", default / "README.md"):
+        path.write_text(marks, encoding="utf-8")
+    scores = {"mean_return_100": [1, 2], "kl": [0.1, 0.2]}
+    for variant in ("ppo", "acppo", "of my own"):
+        make_run(default, variant, **scores)
+        make_run(tmp_path / "other", variant, "Pong", **scores)
+    call(monkeypatch, "--out", default)
+    made, stages = contents(default), claims.make_stages(*collect.read_csvs(default))
+    for name in figures.FIGURES:
+        assert made[f"figures/beginnings/{name}.png"].startswith(b"\x89PNG")
+        assert len(made[f"figures/beginnings/{name}.png"]) > 10_000
+        assert b"</svg>" in made[f"figures/beginnings/{name}.svg"]
+    assert made["README.md"].decode() == marks.replace("old\n", figures.results_part(stages))
+    assert "](figures/beginnings/score.png)" in made["README.md"].decode()
+    assert (tmp_path / "README.md").read_text(encoding="utf-8") == marks.replace("old\n", claims.short_table(stages))
+    assert not list(tmp_path.rglob("*new*"))  # nothing is left of what was written beside
+
+    before = contents(default) | {"above": (tmp_path / "README.md").read_bytes()}
+    call(monkeypatch, "--out", tmp_path / "other")
+    assert (tmp_path / "other" / "figures" / "beginnings" / "kl.svg").exists()
+    assert "| of my own |" in (tmp_path / "other" / "README.md").read_text(encoding="utf-8")
+    shutil.rmtree(default / "runs")  # the rest from the CSVs alone
+    call(monkeypatch, "--out", default)
+    after = contents(default) | {"above": (tmp_path / "README.md").read_bytes()}
+    assert after == {name: data for name, data in before.items() if not name.startswith("runs/")}
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--out", "nowhere"], "has neither runs nor their CSVs"),
+        (["--out", "empty"], "no run there has an iteration"),
+        (["--out", "foreign"], "has other columns"),
+        (["--out", "damaged"], "cannot be read"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty" / "runs").mkdir(parents=True)
+    for name, text in (("foreign", "a,b\n1,2\n"), ("damaged", ",".join(collect.RUN_COLUMNS) + "\nx,y,no number\n")):
+        (tmp_path / name).mkdir()
+        for file in ("runs.csv", "curves.csv"):
+            (tmp_path / name / file).write_text(text)
+    for command in (collect, figures):
+        with pytest.raises(SystemExit) as exit_:
+            call(monkeypatch, *flags, command=command)
+        out, err = capfd.readouterr()
+        assert exit_.value.code == 2 and out == "" and err.count("\n") == 1 and said in err
+
+
+def test_a_readme_that_has_lost_its_marks_is_said_and_left(tmp_path, monkeypatch, capfd):
+    make_csvs(tmp_path, {("ppo", "Pong", 1): {"kl": [1]}})
+    for text in ("<!-- end results -->\n<!-- results -->\n", "<!-- results -->\n<!-- end results -->\n" * 2):
+        (tmp_path / "README.md").write_text(text)
+        with pytest.raises(SystemExit) as exit_:
+            call(monkeypatch, "--out", tmp_path)
+        assert exit_.value.code == 2 and "to write between" in capfd.readouterr().err
+        assert (tmp_path / "README.md").read_text() == text
+
+
+def test_the_results_in_the_repository_are_those_of_its_csvs():
+    stages = claims.make_stages(*collect.read_csvs(collect.DEFAULT_OUT))
+    for path, part in (
+        (collect.DEFAULT_OUT / "README.md", figures.results_part(stages)),
+        (ROOT / "README.md", claims.short_table(stages)),
+    ):
+        assert readme.split_readme(path, "results")[1] == part, "run benchmark/figures.py"
+
+
+def test_neither_the_verdicts_nor_the_grid_import_what_they_do_not_use():
+    """The verdicts go without matplotlib; torch would be imported into every worker of Ray."""
+    program = "import sys, benchmark.claims, benchmark.atari5; print(*{'matplotlib', 'torch'} & set(sys.modules))"
+    run = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert run.stdout == "\n"

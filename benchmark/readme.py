@@ -1,0 +1,29 @@
+"""Markdown tables, and the parts of the READMEs that commands write: from `<!-- NAME -->` to `<!-- end NAME -->`."""
+
+import re
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for bookkeeping.py, if nothing is installed
+from bookkeeping import write_text
+
+
+def markdown(columns: list[str], rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(row) + " |" for row in [columns, ["-"] * len(columns), *rows]) + "\n"
+
+
+def split_readme(readme: Path, name: str) -> tuple[str, str, str] | None:
+    """Returns what stands before the generated part, the part, and what follows; None if it has no such part, once."""
+    try:
+        text = readme.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError):
+        return None
+    parts = re.split(f"<!-- {name} -->\n(.*?)<!-- end {name} -->", text, flags=re.DOTALL)
+    return tuple(parts) if len(parts) == 3 else None
+
+
+def write_part(readme: Path, name: str, part: str) -> bool:
+    """Replaces the generated part of a file; returns whether it has one."""
+    if parts := split_readme(readme, name):
+        write_text(readme, f"{parts[0]}<!-- {name} -->\n{part}<!-- end {name} -->{parts[2]}")
+    return parts is not None

@@ -303,3 +303,16 @@ def test_an_evaluation_draws_its_actions_from_the_policy(script):
     envs.step = lambda given: actions.extend(given) or step(given)
     script.play(agent, envs, 40, seed=[1, 1])
     assert len(actions) > 300 and 0.65 < np.mean(actions) < 0.85
+
+
+def test_evaluations_and_films_play_other_games_than_the_training(script, tmp_path, monkeypatch):
+    args = script.Args(env_id="tiny_envs:RenderedPixels-v0", log_dir=str(tmp_path), threads=1, eval_episodes=1)
+    run, agent, seeds = script.RunDirectory.make(args), agent_for(script, args.env_id), []
+    monkeypatch.setattr(
+        script, "play", lambda agent, envs, num_games, seed: seeds.append(seed) or envs.reset() and [(1.0, 1)]
+    )
+    script.evaluate(args, agent, run, {"args": vars(args), "event_files": {}, "global_step": 0})
+    script.record_game(args, agent, run, global_step=0)
+    assert len(seeds) == 2 and not run.failed
+    numbers = [number for seed in (args.seed, *seeds) for number in env_seeds(seed, 8)]
+    assert len(set(numbers)) == 3 * 8

@@ -110,6 +110,10 @@ ratios are taken to the policy that is being updated | both scripts | test_fast_
 -if epoch_kl > args.target_kl:
 +if epoch_kl > math.inf:
 
+--target-kl is held against the last minibatch | both scripts | test_training.py -k mean_over_an_epoch
+-minibatch_stats[-args.num_minibatches :]
++minibatch_stats[-1:]
+
 the learning rate is one iteration ahead | both scripts | test_training.py -k learning_rate
 -(1 - (iteration - 1) / args.num_iterations)
 +(1 - iteration / args.num_iterations)
@@ -121,6 +125,14 @@ Adam has torch's own eps | both scripts | test_training.py -k own_minibatch
 each rollout begins with the run's first observation | both scripts | test_training.py -k observation_before
 -obs[0] = obs[T]
 +obs[0] = first_obs
+
+a new policy is far from uniform | both scripts | test_training.py -k nearly_uniform
+-nn.Linear(512, num_actions), gain=0.01)
++nn.Linear(512, num_actions), gain=1.0)
+
+hidden layers begin with gain 1 | both scripts | test_training.py -k nearly_uniform
+-gain: float = math.sqrt(2)
++gain: float = 1.0
 
 the KL is that of the last minibatch | both scripts | test_training.py -k every_logged
 -policy_change(b_logprobs, new_logprobs, b_actions, rollout_advantages)
@@ -191,9 +203,17 @@ an evaluation draws from the training's random numbers | both scripts | test_pla
 -act(agent, from_envs(obs, device), generator)
 +act(agent, from_envs(obs, device))
 
+an evaluation plays the games that the training began with | both scripts | test_playing.py -k other_games_than
+-seed=[args.seed, 1])
++seed=[args.seed])
+
 a run is finished only at a step that no whole rollout reaches | benchmark/atari5.py | test_atari5.py -k whole_rollout
 -min(args.total_timesteps // rollout * rollout,
 +min(args.total_timesteps,
+
+the grid goes on with the older of two directories | benchmark/atari5.py | test_atari5.py -k the_newer
+-return max((args.out / "runs").glob(
++return min((args.out / "runs").glob(
 
 the grid goes on with a run of other arguments | benchmark/atari5.py | test_atari5.py -k another_run
 -if (has := trained.get(name)) != value:

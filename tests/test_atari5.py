@@ -396,3 +396,11 @@ def test_a_run_is_finished_at_the_last_whole_rollout_of_its_steps(tmp_path):
 def test_a_checkpoint_of_another_run_is_not_gone_on_with(trained, said, tmp_path):
     run = look_at(tmp_path, 1024, **trained)
     assert run.state == "failed" and said in run.reason
+
+
+def test_of_two_directories_of_a_run_the_newer_is_gone_on_with(tmp_path):
+    look_at(tmp_path, 1024)
+    older = tmp_path / "runs" / "Qbert__ppo__1__1700000000"
+    newer = older.rename(older.with_name("Qbert__ppo__1__1700000100"))
+    look_at(tmp_path, 2048)
+    assert Run("Qbert", "ppo", 1).checkpoint(Args(out=tmp_path)) == newer / "checkpoint.pt"

@@ -326,3 +326,17 @@ def test_an_evaluation_draws_its_actions_from_the_policy(script):
     envs.step = lambda given: actions.extend(given) or step(given)
     play(script.make_policy(agent, 1), envs, 40, seed=[1, 1])
     assert len(actions) > 300 and 0.65 < np.mean(actions) < 0.85
+
+
+def test_evaluations_and_films_play_other_games_than_the_training(script, tmp_path, monkeypatch):
+    args = script.Args(env_id=RENDERED, threads=1, eval_episodes=1)
+    policy, seeds = policy_for(script, RENDERED), []
+    monkeypatch.setattr(
+        bookkeeping, "play", lambda policy, envs, num_games, seed: seeds.append(seed) or envs.reset() and [(1.0, 1)]
+    )
+    with open_run(script, tmp_path) as run:
+        bookkeeping.evaluate(args, policy, run, {"event_files": {}, "global_step": 0})
+        record_game(args, policy, run, step=0)
+        assert len(seeds) == 2 and not run.failed
+    numbers = [number for seed in (args.seed, *seeds) for number in env_seeds(seed, 8)]
+    assert len(set(numbers)) == 3 * 8

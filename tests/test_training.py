@@ -325,3 +325,32 @@ def test_every_action_is_chosen_on_the_observation_before_it(script, tmp_path, m
     for given, (actions, _, _) in rollout.calls:
         assert np.array_equal(given[1], obs)
         obs, *_ = envs.step(actions.numpy())
+
+
+def test_a_target_kl_is_held_against_the_mean_over_an_epoch(script, tmp_path, monkeypatch):
+    """The target lies between that mean and the KL of the epoch's last minibatch, which here are far apart."""
+    objective = Recorder(monkeypatch, script, "surrogate")
+    arguments = {**CARTPOLE, "total_timesteps": 128, "learning_rate": 0.01}
+    train(script, tmp_path / "far", **arguments)
+    ratios = [given[0] for given, _ in objective.calls[:4]]
+    kls = [(ratio - 1 - ratio.log()).mean().item() for ratio in ratios]
+    mean, last = np.mean(kls), kls[-1]
+    assert abs(mean - last) > 0.2 * mean
+    objective.calls.clear()
+    train(script, tmp_path / "between", target_kl=(mean + last) / 2, **arguments)
+    assert (len(objective.calls) == 4) == (mean > last)
+
+
+@pytest.mark.parametrize("obs_shape", [(4,), (4, 84, 84)], ids=["flat", "screens"])
+def test_a_new_network_is_orthogonal_with_a_nearly_uniform_policy(script, obs_shape):
+    """Gain √2 in the hidden layers, 0.01 for the policy and 1 for the value, as in OpenAI's baselines."""
+    torch.manual_seed(1)
+    agent = script.Agent(obs_shape, 6)
+    last = {"actor.weight": 0.01, "actor.4.weight": 0.01, "critic.weight": 1.0, "critic.4.weight": 1.0}
+    for name, parameter in agent.named_parameters():
+        if name.endswith("bias"):
+            assert not parameter.any()
+            continue
+        weight = parameter.detach().flatten(1)
+        short = weight @ weight.T if len(weight) <= weight.shape[1] else weight.T @ weight
+        assert torch.allclose(short, last.get(name, 2**0.5) ** 2 * torch.eye(len(short)), atol=1e-4), name

@@ -46,10 +46,15 @@ def each_script(request):
 
 # ------------------------------------------------------------------------------------------- what a run leaves behind
 def scalars(run_dir) -> dict[str, list[tuple[int, float]]]:
-    """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points."""
+    """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points.
+
+    In the order of their writing: event files that two starts in one second make, as only tests can, have names in
+    any order.
+    """
     reader = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
     reader.Reload()
-    return {tag: [(event.step, event.value) for event in reader.Scalars(tag)] for tag in reader.Tags()["scalars"]}
+    events = {tag: sorted(reader.Scalars(tag), key=lambda event: event.wall_time) for tag in reader.Tags()["scalars"]}
+    return {tag: [(event.step, event.value) for event in written] for tag, written in events.items()}
 
 
 def values(logged: dict, tag: str) -> np.ndarray:

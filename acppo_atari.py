@@ -6,10 +6,10 @@ What differs from ppo_atari.py is this text, the arguments clip_coef and c, clip
     python acppo_atari.py --env-id Breakout --c 1.0
     tensorboard --logdir runs
 
-8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (the README has the speed and the
-scores on the way). Scores, losses and how far each update moved the policy go to TensorBoard; the README defines every
-curve. A stopped or killed run goes on with `--resume`. The two scripts are siblings: their diff is the whole of AC-PPO,
-and a change to one is a change to both. The environments are in wrappers.py; all that keeps a run is in bookkeeping.py.
+8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (the README has measured speeds).
+Scores, losses and how far each update moved the policy go to TensorBoard; the README defines every curve. A stopped or
+killed run goes on with `--resume`. The two scripts are siblings: every change goes into both, so that their diff stays
+AC-PPO alone. wrappers.py has the environments; bookkeeping.py has checkpoints, logging, signals, evaluation and videos.
 
 Sections: arguments, network, mathematics, training, command line.
 """
@@ -23,7 +23,7 @@ from functools import partial
 
 import bookkeeping
 
-if __name__ == "__main__":  # only here, because importing this file must leave the importer's process as it is
+if __name__ == "__main__":  # not on import: it changes settings of the whole process
     bookkeeping.tune_process()  # before torch is imported
 
 import numpy as np
@@ -56,8 +56,8 @@ class Args:
     """the environment: an Atari game by its bare name (thesis protocol), `ALE/Breakout-v5` (the same with sticky
     actions), or a Gymnasium id with discrete actions such as `CartPole-v1`"""
     total_timesteps: PositiveInt = 5_000_000
-    """agent steps in all, over all environments; Atari shows 4 frames for each, so this is the thesis's 20M frames
-    (chapter 4). Rounded down to whole rollouts"""
+    """agent steps of the whole run, summed over environments; one is 4 Atari frames, so these are the thesis's 20M
+    frames (chapter 4). Rounded down to whole rollouts"""
     learning_rate: PositiveFloat = 2.5e-4
     """Adam's step size at the start (appendix A)"""
     num_envs: PositiveInt = 8
@@ -71,7 +71,7 @@ class Args:
     gae_lambda: Fraction = 0.95
     """λ of the generalised advantage estimator (section 2.5, appendix A)"""
     num_minibatches: PositiveInt = 4
-    """minibatches that a rollout is cut into: N·T / 4 = 256 samples each (appendix A)"""
+    """minibatches that a rollout is cut into: N·T / 4 = 256 samples each at the defaults (appendix A)"""
     update_epochs: PositiveInt = 4
     """passes over each rollout (appendix A)"""
     norm_adv: bool = True
@@ -83,10 +83,10 @@ class Args:
     """weight of the advantage in the clip range ε / (1 + c·|Â|) (section 3.1): 0 is PPO, `inf` the range δ / |Â|, which
     is the thesis's product-only objective"""
     clip_vloss: bool = True
-    """clip the value loss as CleanRL does; `--no-clip-vloss` is half the plain squared error of appendix B"""
+    """clip the value loss as CleanRL does; `--no-clip-vloss` gives half the squared error, as appendix B"""
     vf_clip_coef: PositiveFloat = 0.1
-    """how far a value may move in one update before its loss stops pulling, in units of return (CleanRL uses
-    its clip range; here it is a coefficient of its own, so that ε never touches the value loss)"""
+    """how far a value may move in one update before its gradient is cut off, in units of return (CleanRL reuses
+    clip_coef; a coefficient of its own keeps ε out of the value loss)"""
     ent_coef: NonNegativeFloat = 0.01
     """weight of the entropy bonus, c₂ (appendix A)"""
     vf_coef: NonNegativeFloat = 0.5
@@ -97,13 +97,13 @@ class Args:
     """skip the remaining epochs once the mean of (ρ - 1) - log ρ over an epoch exceeds this, in nats (CleanRL,
     which looks at the last minibatch)"""
     seed: NonNegativeInt = 1
-    """seeds torch and, through one SeedSequence, every environment with a number of its own"""
+    """seed of torch, and of a SeedSequence that gives each environment a seed of its own"""
     torch_deterministic: bool = True
     """have cuDNN choose deterministic algorithms (CleanRL); on a CPU, seed and thread count determine the run"""
     cuda: bool = True
     """use a GPU if there is one"""
     threads: Threads = field(default_factory=bookkeeping.available_cores)
-    """threads for torch and for the games, which take turns; the default is the cores this process may use"""
+    """threads of torch; the emulators use as many, in turn with it. The default is the cores this process may use"""
     bf16: bool = False
     """run the network's trunk in bfloat16 (ours): faster on processors with AVX512-BF16 or AMX, far slower on others;
     parameters, logits, values and losses stay float32"""
@@ -116,15 +116,15 @@ class Args:
     eval_episodes: NonNegativeInt = 10
     """whole games that are played and scored when the training is finished, without learning; 0 for none"""
     capture_video: bool = False
-    """record a whole game, in `videos/` of the run: at the start, at each quarter of the training and at its end, or
-    with `--evaluate` one"""
+    """film a whole game, into `videos/` of the run, at the start, at each quarter and at the end of the training; with
+    `--evaluate`, one game"""
     evaluate: str | None = None
-    """directory of a run whose checkpoint is to play `--eval-episodes` games; nothing is trained"""
+    """evaluate the checkpoint in this run directory for `--eval-episodes` games, without training"""
     resume: str | None = None
-    """directory of a run to go on with, under its own arguments; a flag given beside this one replaces the run's"""
+    """go on with the run in this directory, with its saved arguments; flags given as well override them"""
     stop_at: PositiveInt | None = None
-    """agent steps at which this call ends, with a checkpoint, rounded up to whole rollouts; the schedule stays that of
-    the whole run"""
+    """end this call at this many agent steps (rounded up to whole rollouts), with a checkpoint; the schedule stays that
+    of the whole run"""
 
     @property
     def batch_size(self) -> int:
@@ -143,11 +143,11 @@ class Args:
     @property
     def last_iteration(self) -> int:
         """The iteration that this call ends with."""
-        most = self.num_iterations if self.stop_at is None else -(-self.stop_at // self.batch_size)  # rounded up
-        return min(self.num_iterations, most)
+        stop_at = self.total_timesteps if self.stop_at is None else self.stop_at
+        return min(self.num_iterations, math.ceil(stop_at / self.batch_size))
 
     def rules(self) -> list[tuple[str, bool, str]]:
-        """Returns (argument, whether it holds, advice) of what two arguments must fulfil together."""
+        """Returns (argument, does it hold, advice) for each rule that involves two arguments."""
         rollout = f"num_envs · num_steps = {self.batch_size}"
         return [
             ("num_steps", self.batch_size <= 1_000_000, "give a rollout of at most 1,000,000 samples"),
@@ -161,7 +161,7 @@ class Args:
 
 # ------------------------------------------------------------------------------------------------------ network
 class Agent(nn.Module):
-    """Policy and value function: the Nature CNN shared by both for images, a small tanh MLP each for flat inputs."""
+    """Policy and value function: a shared Nature CNN for images; for flat inputs, a small tanh MLP for each."""
 
     def __init__(self, obs_shape: tuple[int, ...], num_actions: int, bf16: bool = False):
         super().__init__()
@@ -187,11 +187,11 @@ class Agent(nn.Module):
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Maps observations, uint8 (B, 84, 84, 4) or float32 (B, D), to logits (B, A) and values (B,)."""
-        # The view makes (B, 4, 84, 84) in channels-last layout, where a gradient step takes 114 ms, 153 in torch's.
+        # A channels-last view: a gradient step takes 114 ms, 153 in torch's own layout (benchmark/tricks.py)
         x = obs.movedim(-1, 1)
         if obs.dtype == torch.uint8:
             x = x.float().div_(255.0)  # 2.2 ms for a minibatch, x / 255 takes 3.2
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bf16):  # the trunk alone: ratios need float32
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bf16):  # only the trunk: ratios need float32
             hidden = self.network(x).float()
         return self.actor(hidden), self.critic(hidden).squeeze(-1)
 
@@ -214,7 +214,7 @@ def tanh_mlp(num_inputs: int, num_outputs: int, gain: float) -> nn.Module:
 
 
 def from_envs(array: np.ndarray, device: torch.device) -> Tensor:
-    """Moves observations to the network: screens (N, 4, 84, 84) → (N, 84, 84, 4); flat ones stay as they are."""
+    """Moves observations to the device, channels last: (N, 4, 84, 84) → (N, 84, 84, 4); flat ones stay as they are."""
     return torch.from_numpy(array).to(device).movedim(1, -1)
 
 
@@ -222,7 +222,7 @@ def from_envs(array: np.ndarray, device: torch.device) -> Tensor:
 def act(agent: nn.Module, obs: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Samples actions (B,) and returns them with the log-probabilities of all actions (B, A) and the values (B,)."""
     logits, values = agent(obs)
-    logprobs = logits.log_softmax(-1)  # by hand: a validated Categorical takes 1.8 times as long
+    logprobs = logits.log_softmax(-1)  # not a Categorical, which takes 1.8 times as long
     return torch.multinomial(logprobs.exp(), 1, generator=generator).squeeze(-1), logprobs, values
 
 
@@ -253,12 +253,12 @@ def make_policy(agent: Agent, seed: int) -> Callable[[np.ndarray], np.ndarray]:
 def compute_gae(rewards, values, next_values, terminations, truncations, gamma: float, gae_lambda: float) -> Tensor:
     """Returns the generalised advantages (T, N) of a rollout: section 2.5, with the masks that appendix B lacks.
 
-    Args, tensors (T, N): `rewards` of step t; `values` V(s_t); `next_values` V(s_t+1), where an episode was truncated
-    V(the observation it ended on); `terminations` and `truncations`, bool, of step t. A termination means that nothing
-    follows; a truncation only that nothing more was seen.
+    Args, tensors (T, N): `rewards`; `values`, V(s_t); `next_values`, V(s_t+1), or V(final observation) if the episode
+    was truncated at t; `terminations` and `truncations`, bool. After a termination nothing follows; after a truncation
+    the episode would have gone on.
     """
     deltas = rewards + gamma * next_values * ~terminations - values  # δ_t
-    not_done = ~(terminations | truncations)  # no advantage flows back out of the next episode
+    not_done = ~(terminations | truncations)  # the sum of an episode stops at its end
     advantages = torch.zeros_like(rewards)
     last_advantage = torch.zeros_like(rewards[0])
     for t in reversed(range(len(rewards))):
@@ -282,12 +282,12 @@ def clip_range(advantages: Tensor, clip_coef: float, c: float) -> Tensor:
 
 def surrogate(ratio: Tensor, advantages: Tensor, clip: Tensor) -> Tensor:
     """Returns the clipped objective of each sample (B,), to be maximised: the term inside the expectation of (2.14)."""
-    # The minimum is a lower bound: a clipped sample gains nothing, one that got worse still pulls back
+    # Beyond its range a sample gains nothing more, but one that got worse keeps its gradient
     return torch.min(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
 
 
 def value_loss(new_values, values, returns, vf_clip_coef: float | None) -> Tensor:
-    """Returns half the mean squared error of values (B,); of each and its clipped form the larger, unless None."""
+    """Returns half the mean squared error of values (B,); with `vf_clip_coef`, the larger of plain and clipped."""
     squared_error = (new_values - returns).square()
     if vf_clip_coef is not None:
         clipped = values + (new_values - values).clamp(-vf_clip_coef, vf_clip_coef)
@@ -325,7 +325,7 @@ def train(
     that is not finite, before it reaches a checkpoint.
     """
     # Setup
-    stop = stop or StopSignal()  # one that listens to nothing
+    stop = stop or StopSignal()  # one that no signal reaches
     torch.manual_seed(args.seed)
     torch.backends.cudnn.deterministic = args.torch_deterministic
     torch.set_num_threads(args.threads)
@@ -334,11 +334,11 @@ def train(
     # eps as in OpenAI's baselines, not torch's 1e-8; fused: 1.3 ms a step, not 5.7 (benchmark/tricks.py)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     iterations_done = run.start(args, state, agent, optimizer)
-    run.save(args, iterations_done, agent, optimizer)  # there is something to resume from at every moment
-    policy = partial(make_policy, agent, args.seed)
-    bookkeeping.record_game_if_due(args, policy, run, iterations_done)
+    run.save(args, iterations_done, agent, optimizer)  # so that a run can be resumed from its first moment on
+    new_policy = partial(make_policy, agent, args.seed)
+    bookkeeping.record_game_if_due(args, new_policy, run, iterations_done)
 
-    # Storage: T steps of N environments. Row T of `obs` and `values` is where the rollout ends and the next begins.
+    # Storage: T steps of N environments. A rollout ends on row T of `obs` and `values`, which is row 0 of the next one.
     T, N = args.num_steps, args.num_envs
     next_obs, _ = envs.reset(seed=env_seeds(args.seed, N, run.num_starts))
     first_obs = from_envs(next_obs, device)
@@ -349,7 +349,9 @@ def train(
     rewards = torch.zeros((T, N), device=device)
     terminations = torch.zeros((T, N), dtype=torch.bool, device=device)
     truncations = torch.zeros((T, N), dtype=torch.bool, device=device)
-    final_values = torch.zeros((T, N), device=device)  # V(final observation) of truncated episodes; elsewhere stale
+    final_values = torch.zeros(
+        (T, N), device=device
+    )  # V(final observation) of truncated episodes; other entries are not read
     obs[T] = first_obs
     stopwatch, status_line = Stopwatch(), StatusLine()
 
@@ -395,14 +397,14 @@ def train(
 
         # Update: several epochs of minibatch gradient steps on the rollout
         vf_clip_coef = args.vf_clip_coef if args.clip_vloss else None
-        minibatch_stats = []  # of tensors, read once an iteration: .item() in here would wait for the device
+        minibatch_stats = []  # tensors, read once an iteration: .item() in here would wait for the device
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(args.batch_size, device=device).split(args.minibatch_size):
                 # index_select copies whole screens: 0.2 ms where b_obs[mb_inds] takes 3.3 ms
                 logits, new_values = agent(b_obs.index_select(0, mb_inds))
                 new_logprobs = logits.log_softmax(-1)
                 logratio = (new_logprobs - b_logprobs[mb_inds]).gather(1, b_actions[mb_inds, None]).squeeze(1)
-                ratio = logratio.exp()  # ρ, 1 for all samples of the first minibatch
+                ratio = logratio.exp()  # ρ; 1 in the first minibatch, but for rounding
                 mb_advantages = b_advantages[mb_inds]
                 if args.norm_adv:
                     mb_advantages = normalize(mb_advantages)
@@ -421,12 +423,12 @@ def train(
                 with torch.no_grad():
                     approx_kl = ((ratio - 1) - logratio).mean()
                     clipfrac = ((ratio - 1).abs() > clip).float().mean()  # each sample against its own range
-                    avg_clip_ratio = clip.clamp(max=1).mean()  # a range above 1 cannot bind below; δ / 0 is infinite
+                    avg_clip_ratio = clip.clamp(max=1).mean()  # no ratio falls by more than 1; a range can be infinite
                 stats = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "clipfrac": clipfrac}
                 stats |= {"avg_clip_ratio": avg_clip_ratio, "minibatch_approx_kl": approx_kl}
                 minibatch_stats.append(torch.stack(list(stats.values())).detach())
             if args.target_kl is not None:
-                epoch_kl = torch.stack(minibatch_stats[-args.num_minibatches :])[:, -1].mean()  # of approx_kl, the last
+                epoch_kl = torch.stack(minibatch_stats[-args.num_minibatches :])[:, -1].mean()  # the last column
                 if epoch_kl > args.target_kl:
                     break
         stopwatch.lap("update")
@@ -449,16 +451,17 @@ def train(
             raise FloatingPointError(f"not finite in iteration {iteration}, step {global_step}: {', '.join(broken)}")
         losses["explained_variance"] = explained_variance.item()  # may be NaN
         del losses["minibatch_approx_kl"]  # no curve of its own: `approx_kl` is that of the whole update
-        charts = {"charts/learning_rate": optimizer.param_groups[0]["lr"], **stopwatch.read(args.batch_size)}
+        charts = {"charts/learning_rate": optimizer.param_groups[0]["lr"], **stopwatch.end_iteration(args.batch_size)}
         run.log(global_step, {**charts, **{f"losses/{name}": value for name, value in losses.items()}}, games)
         status_line.show(args, iteration, charts["charts/SPS"], run.last_scores)
 
-        # Checkpoint
-        if not stop.number:
-            bookkeeping.record_game_if_due(args, policy, run, iteration)
-        if stop.number or iteration == args.last_iteration or run.is_checkpoint_due():
+        # Film and checkpoint
+        stopping = stop.number != 0  # read once: a signal after this line is served in the next iteration
+        if not stopping:
+            bookkeeping.record_game_if_due(args, new_policy, run, iteration)
+        if stopping or iteration == args.last_iteration or run.is_checkpoint_due():
             run.save(args, iteration, agent, optimizer)
-        if stop.number:
+        if stopping:
             break
 
     envs.close()
@@ -473,7 +476,7 @@ def main() -> None:
             agent = train(args, envs, run, state, stop)
         else:
             agent = make_agent(args, envs)
-            run.start(args, state, agent)
+            run.restore_agent(state, agent)
     except FloatingPointError as error:
         say(f"{run.path}: {error}")
         sys.exit(1)

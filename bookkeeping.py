@@ -1,9 +1,9 @@
-"""What keeps a run: everything around the two algorithms that is not one.
+"""What surrounds the two algorithms: run directories, checkpoints, logging, signals, evaluation and videos.
 
-The scripts use four things of it. `open_run` decides what a call is to do and refuses what cannot work. `RunDirectory`
-holds a run's checkpoint, event files and `args.json`. `Stopwatch`, `StatusLine` and `StopSignal` accompany the loop.
-`finish` ends a call: it evaluates the agent, or says how to go on. Whole games are played by a policy that is passed in
-as a function, so that this file knows no network and no loss.
+`open_run` decides what a call is to do and refuses what cannot work. `RunDirectory` holds a run's checkpoint, event
+files and `args.json`. `StopSignal`, `Stopwatch` and `StatusLine` accompany the loop, and `finish` ends the call: it
+evaluates the agent or says how to go on. Whole games are played by a policy that is passed in as a function, so this
+file knows no network and no loss.
 
 `benchmark/` uses the small helpers at the top. They cost no torch: it is imported in the functions that need it.
 """
@@ -117,9 +117,9 @@ def bounded(kind: type, allow: Callable[[Any], bool], metavar: str, advice: str)
     return Annotated[kind, Bounds(allow, f"give {advice}"), tyro.conf.arg(metavar=metavar)]
 
 
-# Below 1e30, because float32 must hold what is computed with it
 PositiveInt = bounded(int, lambda x: 0 < x <= 10**12, "1..10^12", "a whole number from 1 to 10^12")
 NonNegativeInt = bounded(int, lambda x: 0 <= x < 2**64, "0..2^64-1", "a whole number from 0 to 2^64 - 1")
+# Below 1e30, because float32 must hold what is computed with them
 PositiveFloat = bounded(float, lambda x: 0 < x < 1e30, ">0", "a number above 0 and below 1e30")
 NonNegativeFloat = bounded(float, lambda x: 0 <= x < 1e30, ">=0", "a number from 0 to below 1e30")
 NonNegativeOrInf = bounded(
@@ -156,8 +156,9 @@ class RunDirectory:
         self.lock = os.open(path, os.O_RDONLY)
         fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
         self.writer = None
-        self.failed = False  # could something not be written?
-        self.waiting = False  # for the next checkpoint to succeed, before more is logged
+        self.waiting = False  # with what is logged, until a checkpoint could be written
+        self.not_written: set[str] = set()
+        self.iteration = 0  # of the last checkpoint
         self.num_starts = 0  # each start of a run plays games of its own
         self.last_scores = deque(maxlen=100)  # raw returns of whole games
         self.checkpoint_due = 0.0
@@ -216,7 +217,15 @@ class RunDirectory:
             raise ValueError("its checkpoint is damaged")
         return state
 
-    def start(self, args, state: dict | None, agent, optimizer=None) -> int:
+    def restore_agent(self, state: dict, agent, name: str = "evaluate") -> None:
+        """Loads the parameters of the checkpoint `state`, or refuses the argument `name`."""
+        try:
+            agent.load_state_dict(state["agent"])
+        except Exception as error:  # parameters of another network
+            refuse(flag(name, self.path), f"its checkpoint does not fit this script ({type(error).__name__})")
+        self.iteration = state["iteration"]
+
+    def start(self, args, state: dict | None, agent, optimizer) -> int:
         """Starts afresh, or restores the checkpoint `state` into `agent` and `optimizer`; returns the iterations done.
 
         The emulators' state is not saved, so a resumed run starts new games. What was logged after the checkpoint is
@@ -224,25 +233,19 @@ class RunDirectory:
         """
         import torch
 
-        done = 0
         if state is not None:
-            try:
-                agent.load_state_dict(state["agent"])
-                if optimizer is None:  # for playing alone
-                    return state["iteration"]
-                optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
-                torch.set_rng_state(state["rng"][0])
-                if torch.cuda.is_available() and len(state["rng"]) > 1:
-                    torch.cuda.set_rng_state(state["rng"][1])
-                done, self.num_starts = state["iteration"], state["num_starts"]
-                self.last_scores.extend(state["last_scores"])
+            self.restore_agent(state, agent, "resume")
+            optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
+            torch.set_rng_state(state["rng"][0])
+            if len(state["rng"]) > 1 and next(agent.parameters()).is_cuda:
+                torch.cuda.set_rng_state(state["rng"][1])
+            self.num_starts = state["num_starts"]
+            self.last_scores.extend(state["last_scores"])
+            with self.reporting("the event file"):
                 for name, size in self.event_files().items():
                     os.truncate(os.path.join(self.path, name), min(size, state["event_files"].get(name, 0)))
-            except Exception as error:  # parts of another network can make them raise anything
-                name = "evaluate" if optimizer is None else "resume"
-                refuse(flag(name, self.path), f"its checkpoint does not fit this script ({type(error).__name__})")
-        self.describe(args, done * args.batch_size)
-        return done
+        self.describe(args, self.iteration * args.batch_size)
+        return self.iteration
 
     def describe(self, args, step: int) -> None:
         """Writes the run's arguments and provenance to `args.json` and TensorBoard, and the layout of its page."""
@@ -252,51 +255,43 @@ class RunDirectory:
             "args": saved_args(args),
             "provenance": provenance(),
         }
-        with self.reporting():
+        with self.reporting("args.json"):
             write_text(os.path.join(self.path, "args.json"), json.dumps(about, indent=2))
-        with self.logging():
-            self.event_writer().add_custom_scalars(TENSORBOARD_LAYOUT)
+        with self.reporting("the event file"), self.logging() as writer:
+            writer.add_custom_scalars(TENSORBOARD_LAYOUT)
             provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
             for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
                 table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
-                self.writer.add_text(tag, "\n".join(table), step)
-            self.writer.flush()
+                writer.add_text(tag, "\n".join(table), step)
 
     def log(self, step: int, scalars: dict[str, float], games: list[tuple[int, float, int]] = ()) -> None:
         """Writes scalars at an agent step, and games as (agent step, score, length) at the steps where they ended."""
-        points = []
-        for end, score, length in games:
-            self.last_scores.append(score)
-            points += [("charts/episodic_return", score, end), ("charts/episodic_length", length, end)]
-        if self.last_scores:
-            points.append(("charts/mean_return_100", np.mean(self.last_scores), step))
-        self.log_points([*points, *((tag, value, step) for tag, value in scalars.items())])
+        self.last_scores.extend(score for _, score, _ in games)
+        if self.waiting:
+            return
+        with self.reporting("the event file"), self.logging() as writer:
+            for end, score, length in games:
+                writer.add_scalar("charts/episodic_return", score, end)
+                writer.add_scalar("charts/episodic_length", length, end)
+            if self.last_scores:
+                writer.add_scalar("charts/mean_return_100", np.mean(self.last_scores), step)
+            for tag, value in scalars.items():
+                writer.add_scalar(tag, value, step)
 
-    def log_points(self, points: list[tuple[str, float, int]]) -> None:
-        """Writes (tag, value, agent step) to TensorBoard."""
-        with self.logging():
-            if not self.waiting:
-                for point in points:
-                    self.event_writer().add_scalar(*point)
-                self.event_writer().flush()
+    def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], step: int) -> None:
+        """Writes games as (score, length) to `eval.csv`, and their statistics to an event file of their own.
 
-    def event_writer(self):
+        A resumed run keeps that file, which has nothing to do with how far the training had got.
+        """
         from torch.utils.tensorboard import SummaryWriter
 
-        self.writer = self.writer or SummaryWriter(self.path)
-        return self.writer
-
-    def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], state: dict) -> None:
-        """Writes the games that the agent of checkpoint `state` has played to `eval.csv`, and their statistics."""
-        before, step = self.event_files(), state["global_step"]
-        self.log_points([(f"eval/{name}", value, step) for name, value in stats.items()])
-        path = os.path.join(self.path, "eval.csv")
-        with self.reporting(), open(path, "a", newline="", encoding="utf-8") as file:
-            rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
-            csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
-        # So that a resumed run keeps these points, and is still rid of others after the checkpoint
-        grown = {name: size for name, size in self.event_files().items() if size != before.get(name)}
-        self.write({**state, "event_files": {**state["event_files"], **grown}})
+        with self.reporting("the evaluation"):
+            with SummaryWriter(self.path, filename_suffix=".eval") as writer:
+                for name, value in stats.items():
+                    writer.add_scalar(f"eval/{name}", value, step)
+            with open(os.path.join(self.path, "eval.csv"), "a", newline="", encoding="utf-8") as file:
+                rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
+                csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
 
     def save(self, args, iteration: int, agent, optimizer) -> None:
         """Writes a checkpoint, and sets the time at which the next is due."""
@@ -319,45 +314,48 @@ class RunDirectory:
         import torch
 
         new = self.checkpoint + ".new"
-        try:
-            with open(new, "wb") as file:
-                torch.save(state, file)
-            for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
-                with open(name, "rb+") as file:  # on the disk before the rename is, even if the power fails
-                    os.fsync(file.fileno())
-            os.replace(new, self.checkpoint)
-            os.fsync(self.lock)
-            self.waiting = False
-        except (OSError, RuntimeError) as error:  # torch raises the latter for the former
-            self.report(error)
-            with contextlib.suppress(OSError):
-                os.remove(new)
+        with self.reporting("the checkpoint"):
+            try:
+                with open(new, "wb") as file:
+                    torch.save(state, file)
+                for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
+                    with open(name, "rb+") as file:  # on the disk before the rename is, even if the power fails
+                        os.fsync(file.fileno())
+                os.replace(new, self.checkpoint)
+                os.fsync(self.lock)
+                self.iteration, self.waiting = state["iteration"], False
+            except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
+                with contextlib.suppress(OSError):
+                    os.remove(new)
+                raise OSError(str(error)) from error
 
     @contextlib.contextmanager
-    def logging(self) -> Iterator[None]:
-        """Reports what cannot be written to TensorBoard in its body; no more is until a checkpoint has been."""
+    def logging(self) -> Iterator[Any]:
+        """Gives the event writer. If it fails, nothing more is logged until a checkpoint has been written."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        try:
+            self.writer = self.writer or SummaryWriter(self.path)
+            yield self.writer
+            self.writer.flush()
+        except OSError:
+            self.writer, self.waiting = None, True  # the writer's thread is dead
+            raise
+
+    @contextlib.contextmanager
+    def reporting(self, what: str) -> Iterator[None]:
+        """Says once that `what` cannot be written, and lets the run go on."""
         try:
             yield
         except OSError as error:
-            self.writer, self.waiting = None, True  # its thread has died of it; a checkpoint is followed by a new one
-            self.report(error)
-
-    @contextlib.contextmanager
-    def reporting(self) -> Iterator[None]:
-        """Reports what cannot be written in its body."""
-        try:
-            yield
-        except OSError as error:
-            self.report(error)
-
-    def report(self, error: Exception) -> None:
-        if not self.failed:
-            say(f"{self.path}: {error}; the run goes on, what cannot be written is lost")
-        self.failed = True
+            if what not in self.not_written:
+                say(f"{self.path}: {what} cannot be written ({error}); the run goes on")
+            self.not_written.add(what)
 
     def event_files(self) -> dict[str, int]:
-        """Returns the size in bytes of each event file, by name."""
-        return {file.name: file.stat().st_size for file in os.scandir(self.path) if file.name.startswith("events.")}
+        """Returns the size in bytes of each event file of the training, by name."""
+        files = [file for file in os.scandir(self.path) if file.name.startswith("events.")]
+        return {file.name: file.stat().st_size for file in files if not file.name.endswith(".eval")}
 
 
 # ---------------------------------------------------------------------------------------------- beside the loop
@@ -367,7 +365,7 @@ class StopSignal:
     number = 0
 
     def listen(self, handler=None) -> None:
-        """From here on; `signal.SIG_DFL` gives the signals back to the system."""
+        """Installs `handler` for both signals, by default `note`; `signal.SIG_DFL` gives them back to the system."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, self.note if handler is None else handler)
 
@@ -391,8 +389,8 @@ class Stopwatch:
         self.seconds[phase] = self.seconds.get(phase, 0.0) + now - self.last
         self.last = now
 
-    def read(self, batch_size: int) -> dict[str, float]:
-        """Ends an iteration of `batch_size` agent steps: returns its tags. What follows counts in the next one."""
+    def end_iteration(self, batch_size: int) -> dict[str, float]:
+        """Returns the tags of an iteration of `batch_size` agent steps. What follows counts in the next one."""
         self.lap("rest")
         self.iteration_ends.append(self.last)
         sps = (len(self.iteration_ends) - 1) * batch_size / (self.iteration_ends[-1] - self.iteration_ends[0])
@@ -473,26 +471,27 @@ def play(policy: Policy, envs: VectorEnv, num_games: int, seed: list[int]) -> li
     return [game for played, share in zip(games, shares, strict=True) for game in played[:share]]
 
 
-def evaluate(args, policy: Policy, run: RunDirectory, state: dict) -> None:
-    """Plays `args.eval_episodes` games with a checkpoint's policy, for the terminal, TensorBoard and `eval.csv`."""
+def evaluate(args, policy: Policy, run: RunDirectory, step: int) -> None:
+    """Plays `args.eval_episodes` games with the policy of agent step `step`, and prints and logs their scores."""
     import torch
 
     torch.set_num_threads(args.threads)
     envs = make_envs(args.env_id, min(args.num_envs, args.eval_episodes), args.threads)
     games = play(policy, envs, args.eval_episodes, seed=[args.seed, 1])
+    envs.close()
     if len(games) < args.eval_episodes:
         say(f"{args.eval_episodes - len(games)} of {args.eval_episodes} games did not end, they are left out")
     scores = np.array([score for score, _ in games] or [math.nan])
     std = scores.std(ddof=1) if len(scores) > 1 else 0.0
     stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
-    run.log_evaluation(games, stats, state)
-    print(f"{len(games)} games at step {state['global_step']:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
+    run.log_evaluation(games, stats, step)
+    print(f"{len(games)} games at step {step:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
 
 
 def record_game(args, policy: Policy, run: RunDirectory, step: int) -> None:
     """Plays one game into `videos/` of the run, with its score in the file's name."""
     path = os.path.join(run.path, "videos", f"step_{step}")
-    with run.reporting():
+    with run.reporting("the video"):
         os.makedirs(os.path.dirname(path), exist_ok=True)
         envs = make_envs(args.env_id, 1, args.threads, video=path + ".webm")
         scores = [score for score, _ in play(policy, envs, 1, seed=[args.seed, 2])]
@@ -501,10 +500,10 @@ def record_game(args, policy: Policy, run: RunDirectory, step: int) -> None:
         os.replace(path + ".webm", f"{path}_{result}.webm")
 
 
-def record_game_if_due(args, policy: Callable[[], Policy], run: RunDirectory, iteration: int) -> None:
+def record_game_if_due(args, new_policy: Callable[[], Policy], run: RunDirectory, iteration: int) -> None:
     """Records a game at the start and at each quarter of the training, with `--capture-video`."""
     if args.capture_video and iteration in [args.num_iterations * k // 4 for k in range(5)]:
-        record_game(args, policy(), run, iteration * args.batch_size)
+        record_game(args, new_policy(), run, iteration * args.batch_size)
 
 
 # --------------------------------------------------------------------------------------------------- command line
@@ -517,7 +516,8 @@ def open_run(args_class: type, description: str):
     threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
     args = tyro.cli(args_class, description=description)
     stop = StopSignal()
-    stop.listen()
+    if args.evaluate is None:
+        stop.listen()
     run = state = None
     name = "evaluate" if args.resume is None else "resume"
     if (directory := getattr(args, name)) is not None:
@@ -537,27 +537,26 @@ def open_run(args_class: type, description: str):
     try:
         envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
         if args.capture_video:
-            make_envs(args.env_id, 1, video="none yet")  # refused now, if it cannot be rendered
+            make_envs(args.env_id, 1, video="none yet").close()  # refused now, if it cannot be rendered
     except ValueError as error:
         refuse(flag("env_id", args.env_id), error)
     run = run or RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
     return args, envs, run, state, stop
 
 
-def finish(args, policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
+def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
     """Ends a call whose agent is trained or loaded: evaluates it, or says how to go on. Exits with its status."""
     stop.listen(signal.SIG_DFL)  # there is nothing left to save
-    if run.failed:
-        sys.exit(1)
-    state = run.load(type(args))  # as the last save left it
-    if stop.number and state["iteration"] < args.last_iteration:
+    step = run.iteration * args.batch_size
+    stopped = stop.number != 0 and run.iteration < args.last_iteration
+    if stopped:
         stop_at = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
         script = inspect.getfile(type(args))
         say(f"Stopped; go on with: {shlex.join([sys.executable, script, '--resume', run.path, *stop_at])}")
-        sys.exit(128 + stop.number)
-    finished = args.last_iteration == args.num_iterations and not stop.number
-    if args.evaluate is not None or (finished and args.eval_episodes > 0):
-        evaluate(args, policy(), run, state)
-    if args.evaluate is not None and args.capture_video:  # a training has recorded its last agent already
-        record_game(args, policy(), run, state["global_step"])
-    sys.exit(1 if run.failed else 0)
+    elif args.evaluate is not None:
+        evaluate(args, new_policy(), run, step)
+        if args.capture_video:
+            record_game(args, new_policy(), run, step)
+    elif run.iteration == args.num_iterations and args.eval_episodes > 0 and not stop.number and not run.not_written:
+        evaluate(args, new_policy(), run, step)
+    sys.exit(1 if run.not_written else 128 + stop.number if stopped else 0)

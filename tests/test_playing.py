@@ -223,7 +223,7 @@ def recorded(script, run_dir, env_id: str) -> bool:
     args = script.Args(env_id=env_id, threads=1)
     with open_run(script, run_dir) as run:
         record_game(args, policy_for(script, env_id), run, step=7)
-        return not run.failed
+        return not run.not_written
 
 
 def test_the_video_of_a_game_that_does_not_end_has_no_score(script, tmp_path, monkeypatch):
@@ -335,8 +335,8 @@ def test_evaluations_and_films_play_other_games_than_the_training(script, tmp_pa
         bookkeeping, "play", lambda policy, envs, num_games, seed: seeds.append(seed) or envs.reset() and [(1.0, 1)]
     )
     with open_run(script, tmp_path) as run:
-        bookkeeping.evaluate(args, policy, run, {"event_files": {}, "global_step": 0})
+        bookkeeping.evaluate(args, policy, run, step=0)
         record_game(args, policy, run, step=0)
-        assert len(seeds) == 2 and not run.failed
+        assert len(seeds) == 2 and not run.not_written
     numbers = [number for seed in (args.seed, *seeds) for number in env_seeds(seed, 8)]
     assert len(set(numbers)) == 3 * 8

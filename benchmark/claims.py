@@ -360,8 +360,10 @@ def progress_table(curves: Curves, parts: int = 10) -> str:
     for (variant, game, seed), curve in curves.items():
         tenths = [curve.iloc[len(curve) * i // parts : len(curve) * (i + 1) // parts] for i in range(parts)]
         run = f"{game} {variant} {seed}"
-        table.append([run, "score", *(f"{tenth.mean_return_100.iloc[-1]:,.0f}" for tenth in tenths)])
-        table.append([run, "KL", *(f"{tenth.kl.mean():.2g}" for tenth in tenths)])
+        table.append(
+            [run, "score", *(f"{tenth.mean_return_100.iloc[-1]:,.0f}" if len(tenth) else "–" for tenth in tenths)]
+        )
+        table.append([run, "KL", *(f"{tenth.kl.mean():.2g}" if len(tenth) else "–" for tenth in tenths)])
     return markdown(["run", "of the run", *(f"{100 * (i + 1) // parts} %" for i in range(parts))], table)
 
 

@@ -221,6 +221,8 @@ all must agree; the table counts those with the claim's sign. Across games, the 
 interquartile mean must exclude "no difference"; with three seeds a game it does so for two equal algorithms one time
 in ten, not in twenty. A final score is judged only by runs that have done {100 * FINISHED:.0f} % of their schedule.
 The whole rule, and since when it stands, opens `benchmark/claims.py`.
+
+Each run's arguments, versions, machine and commit are in `runs.csv`, each of its iterations in `curves.csv`.
 """
 
 
@@ -251,10 +253,7 @@ def coverage(stage: Stage) -> str:
     left_out = [f"{key[1]} {key[0]} {key[2]}" for key in stage.drawn if key not in stage.compared]
     if left_out:
         text += f" In the figures alone, being shorter than half of their game's longest: {', '.join(left_out)}."
-    return (
-        f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {', '.join(machines)}; each run's arguments, versions"
-        " and whole commit are in `runs.csv`.\n"
-    )
+    return f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {'; '.join(machines)}.\n"
 
 
 def stage_tables(stage: Stage) -> dict[str, str]:

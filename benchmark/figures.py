@@ -1,7 +1,7 @@
 """The thesis's figures and tables, and what becomes of its claims: everything that the grid's event files give.
 
     python benchmark/figures.py
-    python benchmark/figures.py --out /tmp/another-grid
+    python benchmark/figures.py --out ../another-grid
 
 `collect.py` brings OUT/runs.csv and OUT/curves.csv up to date, and everything else is made from these two alone:
 OUT/figures/STAGE/*.png and *.svg, and in OUT/README.md, between `<!-- results -->` and `<!-- end results -->`, the
@@ -33,7 +33,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter, NullFormatter
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from benchmark.claims import (
     FEWEST_PAIRS,
     FINISHED,
@@ -203,7 +203,7 @@ def draw(out: Path, stages: list[Stage]) -> None:
     settings = {"font.size": 13, "legend.title_fontsize": 15, "savefig.dpi": 100, "svg.hashsalt": "acppo"}
     for stage, name in itertools.product(stages, FIGURES):
         (directory := out / "figures" / stage.name).mkdir(parents=True, exist_ok=True)
-        with matplotlib.rc_context({**matplotlib.rcParamsDefault, **settings}):  # whatever the user's matplotlibrc says
+        with matplotlib.rc_context({**matplotlib.rcParamsDefault, **settings}):  # not the user's matplotlibrc
             figure = draw_figure(name, stage)
             for suffix, metadata in (("png", {}), ("svg", {"Date": None})):  # equal CSVs give equal files
                 figure.savefig(directory / f"new.{suffix}", metadata=metadata)

@@ -34,7 +34,7 @@ from pathlib import Path
 
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for bookkeeping.py, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from bookkeeping import available_cores, refuse, say
 
 SCRIPTS = Path(__file__).resolve().parent.parent
@@ -66,7 +66,7 @@ PROGRESS = re.compile(r"step ([\d,]+) of [\d,]+, (\d+) SPS(?:, score (-?[\d.]+))
 @dataclass
 class Args:
     games: tuple[str, ...] = ATARI_5
-    """games, or whatever else the scripts take as `--env-id`; the default is Atari-5 (chapter 4)"""
+    """games, or anything else that the scripts take as `--env-id`; the default is Atari-5 (chapter 4)"""
     seeds: tuple[int, ...] = (1, 2, 3)
     """seeds of each variant on each game; all games of one seed come before the next"""
     variants: tuple[str, ...] = ("ppo", "acppo")
@@ -169,7 +169,7 @@ class Run:
         return [sys.executable, str(SCRIPTS / script), *words, *bf16, *COMMON_FLAGS]
 
     def look(self, args: Args) -> None:
-        """Finds out how far it is, and whether what is there is this run: going on with another would mix two."""
+        """Finds out how far it is, and whether its checkpoint is this run's: going on with another would mix two."""
         self.log_size = self.log(args).stat().st_size if self.log(args).exists() else 0
         if (checkpoint := self.checkpoint(args)) is None:
             return
@@ -179,7 +179,7 @@ class Run:
             saved = torch.load(checkpoint, map_location="cpu", weights_only=True)
             trained, self.step = saved["args"], saved["global_step"]
             rollout = trained["num_envs"] * trained["num_steps"]
-        except Exception:  # whatever a file that is no checkpoint makes them raise
+        except Exception:  # a file that is no checkpoint may make them raise anything
             self.state, self.reason = "failed", f"{checkpoint} is damaged; move its directory away"
             return
         wanted = {"c": None, **VARIANTS[self.variant][1], "env_id": self.game, "seed": self.seed}  # PPO has no c
@@ -266,7 +266,7 @@ def run_process(command: list[str], environment: dict[str, str], log) -> int:
 
 # ----------------------------------------------------------------------------------------------------- the driver
 def run_grid(runs: list[Run], args: Args) -> None:
-    """Runs what is queued, to `done` or `failed`. Raises KeyboardInterrupt when interrupted, with all runs stopped."""
+    """Takes the queued runs to `done` or `failed`. Raises KeyboardInterrupt when interrupted, with all runs stopped."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
     import ray
 
@@ -364,7 +364,7 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     check(args)
     args.out = args.out.resolve()  # the tasks stand elsewhere
-    # Seed by seed, variants innermost, so that what is compared is complete early
+    # Seed by seed, variants innermost, so that pairs are complete early
     grid = itertools.product(*map(dict.fromkeys, (args.seeds, args.games, args.variants)))  # each once
     runs = [Run(game, variant, seed) for seed, game, variant in grid]
     try:

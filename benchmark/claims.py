@@ -40,7 +40,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # this file is imported by scripts beside it, too
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from benchmark.collect import KEY
 from benchmark.readme import markdown
 
@@ -359,9 +359,10 @@ def progress_table(curves: Curves, parts: int = 10) -> str:
     table = []
     for (variant, game, seed), curve in curves.items():
         tenths = [curve.iloc[len(curve) * i // parts : len(curve) * (i + 1) // parts] for i in range(parts)]
-        run = f"{game} {variant} {seed}"
-        table.append([run, "score", *(f"{tenth.mean_return_100.iloc[-1]:,.0f}" for tenth in tenths)])
-        table.append([run, "KL", *(f"{tenth.kl.mean():.2g}" for tenth in tenths)])
+        scores, kls = [tenth.mean_return_100.tail(1).mean() for tenth in tenths], [tenth.kl.mean() for tenth in tenths]
+        for name, numbers, form in (("score", scores, ",.0f"), ("KL", kls, ".2g")):
+            cells = [f"{number:{form}}" if math.isfinite(number) else "–" for number in numbers]
+            table.append([f"{game} {variant} {seed}", name, *cells])
     return markdown(["run", "of the run", *(f"{100 * (i + 1) // parts} %" for i in range(parts))], table)
 
 

@@ -1,7 +1,7 @@
 """Event files → OUT/runs.csv, a row a run, and OUT/curves.csv, a row an iteration.
 
     python benchmark/collect.py
-    python benchmark/collect.py --out /tmp/another-grid
+    python benchmark/collect.py --out ../another-grid
 
 Every run directory under OUT/runs is read, a thesis-sized one in six seconds. Runs that are in the CSVs already and
 have no directory here keep their rows, so that grids of several machines add up. A run that is found replaces its own
@@ -20,7 +20,7 @@ import pandas as pd
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for bookkeeping.py, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from bookkeeping import refuse, say, write_text
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -1,7 +1,7 @@
 """The thesis's figures and tables, and what becomes of its claims: everything that the grid's event files give.
 
     python benchmark/figures.py
-    python benchmark/figures.py --out /tmp/another-grid
+    python benchmark/figures.py --out ../another-grid
 
 `collect.py` brings OUT/runs.csv and OUT/curves.csv up to date, and everything else is made from these two alone:
 OUT/figures/STAGE/*.png and *.svg, and in OUT/README.md, between `<!-- results -->` and `<!-- end results -->`, the
@@ -33,7 +33,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter, NullFormatter
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from benchmark.claims import (
     FEWEST_PAIRS,
     FINISHED,
@@ -203,7 +203,7 @@ def draw(out: Path, stages: list[Stage]) -> None:
     settings = {"font.size": 13, "legend.title_fontsize": 15, "savefig.dpi": 100, "svg.hashsalt": "acppo"}
     for stage, name in itertools.product(stages, FIGURES):
         (directory := out / "figures" / stage.name).mkdir(parents=True, exist_ok=True)
-        with matplotlib.rc_context({**matplotlib.rcParamsDefault, **settings}):  # whatever the user's matplotlibrc says
+        with matplotlib.rc_context({**matplotlib.rcParamsDefault, **settings}):  # not the user's matplotlibrc
             figure = draw_figure(name, stage)
             for suffix, metadata in (("png", {}), ("svg", {"Date": None})):  # equal CSVs give equal files
                 figure.savefig(directory / f"new.{suffix}", metadata=metadata)
@@ -221,6 +221,8 @@ all must agree; the table counts those with the claim's sign. Across games, the 
 interquartile mean must exclude "no difference"; with three seeds a game it does so for two equal algorithms one time
 in ten, not in twenty. A final score is judged only by runs that have done {100 * FINISHED:.0f} % of their schedule.
 The whole rule, and since when it stands, opens `benchmark/claims.py`.
+
+Each run's arguments, versions, machine and commit are in `runs.csv`, each of its iterations in `curves.csv`.
 """
 
 
@@ -251,10 +253,7 @@ def coverage(stage: Stage) -> str:
     left_out = [f"{key[1]} {key[0]} {key[2]}" for key in stage.drawn if key not in stage.compared]
     if left_out:
         text += f" In the figures alone, being shorter than half of their game's longest: {', '.join(left_out)}."
-    return (
-        f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {', '.join(machines)}; each run's arguments, versions"
-        " and whole commit are in `runs.csv`.\n"
-    )
+    return f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {'; '.join(machines)}.\n"
 
 
 def stage_tables(stage: Stage) -> dict[str, str]:

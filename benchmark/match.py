@@ -5,12 +5,12 @@
 
 `--on clipfrac` finds the δ of the variant `product`. The thesis's product-only objective (section 3.1) bounds
 abs((ρ - 1)Â) by δ alone, and the thesis gives no δ; held against PPO it is fair if both clip the same share of samples.
-`--on kl` finds the ε of the variant `ppo-matched`: PPO whose KL between policy updates is AC-PPO's, so that what is
-left between the two is the adaptation, not smaller steps.
+`--on kl` finds the ε of the variant `ppo-matched`: PPO whose KL between policy updates is AC-PPO's, so that the two
+differ by the adaptation and not by smaller steps.
 
 The one that is matched and the other at each of `--bounds` are trained for the first iterations of the full schedule,
 `losses/clipfrac` or `losses/kl` is averaged over them, and the bound is where the mean, linear in the bound's log
-between the tried ones, is the matched one's. What is found holds for these iterations. Prints a table; 50 iterations
+between the tried ones, is the matched one's. The answer holds for these iterations. Prints a table; 50 iterations
 take four minutes a run at 210 steps/s. Exit status: 0 all games have a match, 1 some have none, 2 bad input.
 """
 
@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from benchmark.collect import ROOT, read_curve, read_events
 from benchmark.readme import markdown
 from bookkeeping import available_cores, refuse, say
@@ -41,7 +41,7 @@ class Search:
     rises: bool  # with the bound
 
 
-# By the column of curves.csv that is to be equal
+# By the column of curves.csv whose mean is to be equal
 SEARCHES = {
     "clipfrac": Search(("ppo_atari.py",), ("acppo_atari.py", "--c", "inf"), "δ", (0.01, 0.02, 0.04, 0.08), False),
     "kl": Search(("acppo_atari.py",), ("ppo_atari.py",), "ε", (0.04, 0.06, 0.08), True),
@@ -51,7 +51,7 @@ SEARCHES = {
 @dataclass
 class Args:
     on: str
-    """what is to be equal: clipfrac or kl"""
+    """the curve whose mean is to be equal: clipfrac or kl"""
     games: tuple[str, ...] = ("Qbert",)
     """games, named as for the scripts"""
     bounds: tuple[float, ...] = ()
@@ -83,7 +83,7 @@ def mean_over_training(column: str, script: str, *flags: str, steps: int) -> flo
 
 def interpolate(bounds: list[float], means: list[float], wanted: float, rises: bool) -> float:
     """Returns the bound at which the mean is `wanted`; NaN if that is beyond the tried ones, or if the means do not
-    rise (or fall) with the bound, so that noise is larger than what is looked for."""
+    rise (or fall) with the bound, so that noise is larger than the effect."""
     bounds, means = map(np.array, zip(*sorted(zip(bounds, means))))
     sign = 1 if rises else -1
     if (np.diff(sign * means) <= 0).any():

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import tyro
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for bookkeeping.py, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from bookkeeping import refuse
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")

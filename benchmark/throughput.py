@@ -45,7 +45,7 @@ import gymnasium as gym
 import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # for what is imported here, if nothing is installed
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, measure_limits
 from benchmark.readme import markdown, write_part
 from bookkeeping import available_cores, refuse, write_text

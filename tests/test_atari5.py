@@ -277,6 +277,19 @@ def test_a_missing_package_is_named_before_anything_runs(call, monkeypatch):
     assert call() == (2, "", "ray: is not installed; pip install -e '.[benchmark]'\n")
 
 
+def test_a_grid_takes_the_cores_that_it_is_given(tmp_path, call, monkeypatch):
+    import ray
+
+    def refuse_to_start(*_, num_cpus: int, **__):
+        raise ValueError(f"asked for {num_cpus}")
+
+    monkeypatch.setattr(ray, "init", refuse_to_start)
+    flags = ("--games", "Qbert", "--out", str(tmp_path))
+    status, _, said = call(*flags, "--cores", "7", "--cpus-per-run", "5")
+    assert (status, said) == (2, "--address local: Ray does not start there (asked for 7)\n")
+    assert f"asked for {len(os.sched_getaffinity(0))})" in call(*flags)[2]
+
+
 def test_an_interrupted_directory_without_a_checkpoint_does_not_count(tmp_path):
     (tmp_path / "runs" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
     run = Run("Qbert", "ppo", 1)

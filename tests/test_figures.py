@@ -98,11 +98,12 @@ def cells(markdown: str) -> list[list[str]]:
 
 
 # ----------------------------------------------------------------------------------------------------- collect
-def test_all_of_20000_points_are_read(tmp_path):
-    directory = make_run(tmp_path, kl=range(20_000))
+def test_all_points_are_read(tmp_path):
+    """By itself, TensorBoard's reader keeps 10,000 of them."""
+    directory = make_run(tmp_path, kl=range(10_001))
     curve = collect.read_curve(collect.read_events(directory))
-    assert list(curve.index) == [BATCH * i for i in range(1, 20_001)]
-    assert list(curve.kl) == list(range(20_000))
+    assert list(curve.index) == [BATCH * i for i in range(1, 10_002)]
+    assert list(curve.kl) == list(range(10_001))
 
 
 def test_a_step_that_was_logged_twice_keeps_what_was_written_last(tmp_path):
@@ -127,6 +128,20 @@ def test_a_run_gives_a_row_and_its_iterations_with_six_digits(tmp_path):
     nothing = "," * (len(collect.CURVE_COLUMNS) - 6)
     assert lines[0].startswith("variant,game,seed,step,mean_return_100,kl,") and lines[0].endswith(",games_ended")
     assert lines[1:] == [f"acppo,CartPole-v1,7,{row}{nothing}0" for row in ("1024,9,0.333333", "2048,10,3.33333e-06")]
+
+
+def test_the_last_evaluation_counts_by_itself(tmp_path):
+    """A second one of the same agent begins with the games of the first, which eval.csv then holds twice."""
+    directory = make_run(tmp_path, kl=[1], mean_return_100=[5])
+    games = [(1, 10), (2, 20), (1, 10), (2, 20), (3, 60)]
+    rows = "".join(f"1024,{number},{score},99\n" for number, score in games)
+    (directory / "eval.csv").write_text(f"step,game,score,length\n{rows}")
+    make_run(tmp_path, "acppo", kl=[1], mean_return_100=[5])
+    collect.collect(tmp_path)
+    runs = collect.read_csvs(tmp_path)[0].set_index("variant")
+    assert list(runs.loc["ppo", collect.EVALUATION]) == [3, 30, pytest.approx(math.sqrt(700))]
+    assert runs.loc["acppo", collect.EVALUATION].isna().all()
+    assert cells(claims.evaluation_table(runs.reset_index()))[2:] == [["CartPole-v1", "ppo", "1", "30.0 ± 26.5", "3"]]
 
 
 def test_games_are_counted_where_they_ended_and_starts_where_they_differ(tmp_path):

@@ -122,13 +122,8 @@ def test_a_call_prints_a_row_for_each_contender_and_adds_one_for_each_process(tm
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "argv", ["throughput.py", *flags])
     throughput.main()
-<<<<<<< HEAD
     tables = [cells(block) for block in capfd.readouterr().out.split("\n\n") if block.startswith("|")]
-    assert [len(table) for table in tables] == [4, 4]  # speed and split; no limits outside Atari
-=======
-    tables = [cells(block) for block in capsys.readouterr().out.split("\n\n") if block.startswith("|")]
     assert [len(table) for table in tables] == [3, 3]  # speed and split; no limits outside Atari
->>>>>>> h-bench
     for table in tables:
         assert table[2][:4] == ["acppo_atari.py --c 0", "2", "1", "1"]
     _, (line,) = throughput.read_csv(results)

@@ -16,6 +16,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tbparse import SummaryReader
+from torch.utils.tensorboard import SummaryWriter
 
 from conftest import (
     SCRIPTS,
@@ -336,6 +337,21 @@ def test_a_full_disk_is_said_once_and_training_goes_on(script, too_large, tmp_pa
     steps = [step for step, _ in scalars(run_dir)[EVERY_ITERATION]]
     assert steps == sorted(set(steps)) and steps[-1] == total
     assert len(steps) >= iterations - 2 and len(list(run_dir.glob("events.*"))) == 1 + (too_large == "the event file")
+
+
+def test_an_event_file_that_cannot_be_written_has_a_successor_after_the_next_checkpoint(script, tmp_path, monkeypatch):
+    """The second iteration's points are lost; a checkpoint follows each."""
+    add_scalar = SummaryWriter.add_scalar
+
+    def add_scalar_but_one(writer, tag, value, step):
+        if (tag, step) == ("losses/kl", 2 * ITERATION):
+            raise OSError("no space")
+        add_scalar(writer, tag, value, step)
+
+    monkeypatch.setattr(SummaryWriter, "add_scalar", add_scalar_but_one)
+    logged = train(script, tmp_path, **CARTPOLE, total_timesteps=4 * ITERATION, checkpoint_minutes=0)
+    assert [step for step, _ in logged["losses/kl"]] == [ITERATION, 3 * ITERATION, 4 * ITERATION]
+    assert len(list(tmp_path.glob("events.*"))) == 2
 
 
 def test_the_last_checkpoint_is_enough_to_play(script, finished):

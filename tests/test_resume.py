@@ -30,7 +30,7 @@ from conftest import (
     train,
     values,
 )
-from wrappers import make_envs
+from wrappers import env_seeds, make_envs
 
 CARTPOLE = {"env_id": "CartPole-v1", **SMALL}
 ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
@@ -62,14 +62,19 @@ def test_stopped_and_resumed_logs_what_straight_through_logs(script, env_id, tmp
         assert frame[frame.tag == tag].step.tolist() == steps, tag
 
 
+def resume(script, run_dir: Path, **arguments) -> None:
+    """Goes on with a run as its checkpoint is, without the checks of the command line."""
+    args = script.Args(**arguments)
+    with open_run(script, run_dir) as run:
+        script.train(args, make_envs(args.env_id, args.num_envs), run, run.load(script.Args))
+
+
 def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     """Resumed at the step where it stops, a run writes the checkpoint that it has read."""
     arguments = {**CARTPOLE, "total_timesteps": 1280, "stop_at": 384}
     train(script, tmp_path, **arguments)
     before = checkpoint_of(tmp_path)
-    with open_run(script, tmp_path) as run:
-        args = script.Args(**arguments)
-        script.train(args, make_envs("CartPole-v1", 4), run, run.load(script.Args))
+    resume(script, tmp_path, **arguments)
     after = checkpoint_of(tmp_path)
     assert before["optimizer"].keys() == after["optimizer"].keys() and len(before["optimizer"]) > 0
     for index, moments in before["optimizer"].items():
@@ -79,6 +84,15 @@ def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     assert len(before["rng"]) == len(after["rng"]) and all(map(torch.equal, before["rng"], after["rng"]))
     assert before["last_scores"] == after["last_scores"] and len(before["last_scores"]) > 0
     assert (before["starts"], after["starts"]) == (1, 2)
+
+
+def test_a_resumed_run_plays_games_that_it_has_not_played(script, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(script, "env_seeds", lambda *given: drawn.append(env_seeds(*given)) or drawn[-1])
+    train(script, tmp_path, **CARTPOLE, total_timesteps=1280, stop_at=128)
+    for stop_at in (256, 384):
+        resume(script, tmp_path, **CARTPOLE, total_timesteps=1280, stop_at=stop_at)
+    assert len(drawn) == 3 and len(set(sum(drawn, []))) == 3 * SMALL["num_envs"]
 
 
 def killed_and_resumed(script, tmp_path, start, call_main, kills: int) -> dict:

@@ -16,6 +16,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tbparse import SummaryReader
+from torch.utils.tensorboard import SummaryWriter
 
 from conftest import (
     SCRIPTS,
@@ -29,7 +30,7 @@ from conftest import (
     train,
     values,
 )
-from wrappers import make_envs
+from wrappers import env_seeds, make_envs
 
 CARTPOLE = {"env_id": "CartPole-v1", **SMALL}
 ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
@@ -61,14 +62,19 @@ def test_stopped_and_resumed_logs_what_straight_through_logs(script, env_id, tmp
         assert frame[frame.tag == tag].step.tolist() == steps, tag
 
 
+def resume(script, run_dir: Path, **arguments) -> None:
+    """Goes on with a run as its checkpoint is, without the checks of the command line."""
+    args = script.Args(**arguments)
+    with open_run(script, run_dir) as run:
+        script.train(args, make_envs(args.env_id, args.num_envs), run, run.load(script.Args))
+
+
 def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     """Resumed at the step where it stops, a run writes the checkpoint that it has read."""
     arguments = {**CARTPOLE, "total_timesteps": 1280, "stop_at": 384}
     train(script, tmp_path, **arguments)
     before = checkpoint_of(tmp_path)
-    with open_run(script, tmp_path) as run:
-        args = script.Args(**arguments)
-        script.train(args, make_envs("CartPole-v1", 4), run, run.load(script.Args))
+    resume(script, tmp_path, **arguments)
     after = checkpoint_of(tmp_path)
     assert before["optimizer"].keys() == after["optimizer"].keys() and len(before["optimizer"]) > 0
     for index, moments in before["optimizer"].items():
@@ -78,6 +84,15 @@ def test_adams_moments_and_the_random_state_survive(script, tmp_path):
     assert len(before["rng"]) == len(after["rng"]) and all(map(torch.equal, before["rng"], after["rng"]))
     assert before["last_scores"] == after["last_scores"] and len(before["last_scores"]) > 0
     assert (before["num_starts"], after["num_starts"]) == (1, 2)
+
+
+def test_a_resumed_run_plays_games_that_it_has_not_played(script, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(script, "env_seeds", lambda *given: drawn.append(env_seeds(*given)) or drawn[-1])
+    train(script, tmp_path, **CARTPOLE, total_timesteps=1280, stop_at=128)
+    for stop_at in (256, 384):
+        resume(script, tmp_path, **CARTPOLE, total_timesteps=1280, stop_at=stop_at)
+    assert len(drawn) == 3 and len(set(sum(drawn, []))) == 3 * SMALL["num_envs"]
 
 
 def killed_and_resumed(script, tmp_path, start, call_main, kills: int) -> dict:
@@ -334,6 +349,21 @@ def test_a_full_disk_is_said_once_and_training_goes_on(script, too_large, tmp_pa
     steps = [step for step, _ in scalars(run_dir)[EVERY_ITERATION]]
     assert steps == sorted(set(steps)) and steps[-1] == total
     assert len(steps) >= iterations - 2 and len(list(run_dir.glob("events.*"))) == 1 + (too_large == "the event file")
+
+
+def test_an_event_file_that_cannot_be_written_has_a_successor_after_the_next_checkpoint(script, tmp_path, monkeypatch):
+    """The second iteration's points are lost; a checkpoint follows each."""
+    add_scalar = SummaryWriter.add_scalar
+
+    def add_scalar_but_one(writer, tag, value, step):
+        if (tag, step) == ("losses/kl", 2 * ITERATION):
+            raise OSError("no space")
+        add_scalar(writer, tag, value, step)
+
+    monkeypatch.setattr(SummaryWriter, "add_scalar", add_scalar_but_one)
+    logged = train(script, tmp_path, **CARTPOLE, total_timesteps=4 * ITERATION, checkpoint_minutes=0)
+    assert [step for step, _ in logged["losses/kl"]] == [ITERATION, 3 * ITERATION, 4 * ITERATION]
+    assert len(list(tmp_path.glob("events.*"))) == 2
 
 
 def test_the_last_checkpoint_is_enough_to_play(script, finished):

@@ -55,7 +55,7 @@ from benchmark.claims import (
     variants,
 )
 from benchmark.collect import DEFAULT_OUT, KEY, ROOT, read_grid
-from benchmark.readme import write_part
+from benchmark.readme import split_readme, write_part
 from bookkeeping import refuse, write_text
 from wrappers import FRAME_SKIP, find_atari_game
 
@@ -288,10 +288,12 @@ def main() -> None:
         written = [(readme, results_part(stages))]
         if args.out.resolve() == DEFAULT_OUT:
             written.append((ROOT / "README.md", short_table(stages)))
-        for readme, part in written:
-            if not write_part(readme, "results", part):
+        for readme, _ in written:
+            if split_readme(readme, "results") is None:
                 refuse(str(readme), "has no <!-- results --> … <!-- end results -->, once, to write between")
         draw(args.out, stages)
+        for readme, part in written:
+            write_part(readme, "results", part)
     except OSError as error:
         refuse(f"--out {args.out}", f"cannot use {error.filename} ({error.strerror})")
     print(f"{args.out}: runs.csv, curves.csv, figures/, README.md")

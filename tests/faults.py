@@ -154,7 +154,7 @@ environments get the seeds seed, seed + 1, … | wrappers.py | test_wrappers.py
 -return [int(number) for number in numbers[-num_envs:]]
 +return [int(np.sum(seed)) + starts * num_envs + n for n in range(num_envs)]
 
-a resumed run plays its first games again | both scripts | test_resume.py -k other_games
+a resumed run plays its first games again | both scripts | test_resume.py -k has_not_played
 -env_seeds(args.seed, N, run.num_starts)
 +env_seeds(args.seed, N, 0)
 

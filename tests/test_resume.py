@@ -446,18 +446,6 @@ def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, m
     assert outcomes[0] > 60 and outcomes[2] > 60
 
 
-def test_a_resumed_run_plays_other_games_than_before(script, tmp_path):
-    args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=128, **SMALL)
-    seeds = []
-    for _ in range(3):
-        envs = make_envs("CartPole-v1", 4)
-        reset = envs.reset
-        envs.reset = lambda *, seed, reset=reset: seeds.extend(seed) or reset(seed=seed)
-        with open_run(script, tmp_path) as run:
-            script.train(args, envs, run, run.load(script.Args) if seeds else None)
-    assert len(set(seeds)) == len(seeds) == 12
-
-
 def test_a_checkpoint_that_breaks_off_leaves_the_one_before_it(script, tmp_path, monkeypatch, capfd):
     args = script.Args(env_id="CartPole-v1", total_timesteps=1280, stop_at=128, **SMALL)
     run = script.RunDirectory(str(tmp_path))

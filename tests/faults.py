@@ -262,7 +262,19 @@ def copy_with(fault: Fault, directory: Path) -> None:
 
 def first_failure(directory: str, *arguments: str) -> str | None:
     """Returns the id of the first test that fails, None where none does."""
-    command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", *arguments]
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-x",
+        "-q",
+        "--tb=no",
+        "-rfE",
+        "-p",
+        "no:cacheprovider",
+        "-n0",
+        *arguments,
+    ]
     run = subprocess.run(command, cwd=directory, capture_output=True, text=True)
     if failed := re.search(r"^(?:FAILED|ERROR) (?:tests/)?(.*?)(?: - .*)?$", run.stdout, re.MULTILINE):
         return failed[1]

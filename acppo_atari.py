@@ -1,15 +1,16 @@
 """AC-PPO on Atari: PPO with an advantage-dependent clip range (thesis, section 3.1).
 
-Theorem 3.1.1 bounds the error of PPO's surrogate by the product of ratio deviation and advantage, so the clip range
-shrinks where the advantage is large: ε / (1 + c·|Â|) in place of ε. At c = 1 and ε = 0.16 it averages near PPO's 0.1.
-What differs from ppo_atari.py is this text, the arguments clip_coef and c, clip_range, and its call.
+Theorem 3.1.1 bounds the error of PPO's surrogate by the product of ratio deviation and advantage, so a large
+advantage narrows the clip range: ε / (1 + c·|Â|) in place of ε. At c = 1 and ε = 0.16 it averages near PPO's 0.1.
+It differs from ppo_atari.py in this text, the arguments clip_coef and c, clip_range, and its call.
     python acppo_atari.py --env-id Breakout --c 1.0
     tensorboard --logdir runs
 
 8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (the README has measured speeds).
 Scores, losses and how far each update moved the policy go to TensorBoard; the README defines every curve. A stopped or
-killed run goes on with `--resume`. The two scripts are siblings: every change goes into both, so that their diff stays
-AC-PPO alone. wrappers.py has the environments; bookkeeping.py has checkpoints, logging, signals, evaluation and videos.
+killed run goes on with `--resume`. ppo_atari.py and acppo_atari.py are siblings: every change goes into both, so that
+their diff stays AC-PPO alone. wrappers.py has the environments; bookkeeping.py has checkpoints, logging, signals,
+evaluation and videos.
 
 Sections: arguments, network, mathematics, training, command line.
 """
@@ -56,8 +57,8 @@ class Args:
     """the environment: an Atari game by its bare name (thesis protocol), `ALE/Breakout-v5` (the same with sticky
     actions), or a Gymnasium id with discrete actions such as `CartPole-v1`"""
     total_timesteps: PositiveInt = 5_000_000
-    """agent steps of the whole run, summed over environments; one is 4 Atari frames, so these are the thesis's 20M
-    frames (chapter 4). Rounded down to whole rollouts"""
+    """agent steps of the whole run, summed over environments; one is 4 Atari frames, so the default is the
+    thesis's 20M frames (chapter 4). Rounded down to whole rollouts"""
     learning_rate: PositiveFloat = 2.5e-4
     """Adam's step size at the start (appendix A)"""
     num_envs: PositiveInt = 8
@@ -77,7 +78,7 @@ class Args:
     norm_adv: bool = True
     """normalise the advantages of each minibatch (appendix B, line 28)"""
     clip_coef: PositiveFloat = 0.16
-    """clip range of the probability ratio where the advantage is 0, ε (chapter 4); with `--c inf`, the bound δ on
+    """clip range of the probability ratio at an advantage of 0, ε (chapter 4); with `--c inf`, the bound δ on
     the product of ratio deviation and normalised advantage"""
     c: NonNegativeOrInf = 1.0
     """weight of the advantage in the clip range ε / (1 + c·|Â|) (section 3.1): 0 is PPO, `inf` the range δ / |Â|, which
@@ -85,8 +86,8 @@ class Args:
     clip_vloss: bool = True
     """clip the value loss as CleanRL does; `--no-clip-vloss` gives half the squared error, as appendix B"""
     vf_clip_coef: PositiveFloat = 0.1
-    """how far a value may move in one update before its gradient is cut off, in units of return (CleanRL reuses
-    clip_coef; a coefficient of its own keeps ε out of the value loss)"""
+    """how far a value may move towards its return in one iteration before its gradient is cut off, in units of return
+    (CleanRL reuses clip_coef; a coefficient of its own keeps ε out of the value loss)"""
     ent_coef: NonNegativeFloat = 0.01
     """weight of the entropy bonus, c₂ (appendix A)"""
     vf_coef: NonNegativeFloat = 0.5
@@ -147,7 +148,7 @@ class Args:
         return min(self.num_iterations, math.ceil(stop_at / self.batch_size))
 
     def rules(self) -> list[tuple[str, bool, str]]:
-        """Returns (argument, does it hold, advice) for each rule that involves two arguments."""
+        """Returns (argument, does it hold, advice) for each rule that involves several arguments."""
         rollout = f"num_envs · num_steps = {self.batch_size}"
         return [
             ("num_steps", self.batch_size <= 1_000_000, "give a rollout of at most 1,000,000 samples"),
@@ -253,7 +254,7 @@ def make_policy(agent: Agent, seed: int) -> Callable[[np.ndarray], np.ndarray]:
 def compute_gae(rewards, values, next_values, terminations, truncations, gamma: float, gae_lambda: float) -> Tensor:
     """Returns the generalised advantages (T, N) of a rollout: section 2.5, with the masks that appendix B lacks.
 
-    Args, tensors (T, N): `rewards`; `values`, V(s_t); `next_values`, V(s_t+1), or V(final observation) if the episode
+    Args, tensors (T, N): `rewards`; `values`, V(s_t); `next_values`, V(s_{t+1}), or V(final observation) if the episode
     was truncated at t; `terminations` and `truncations`, bool. After a termination nothing follows; after a truncation
     the episode would have gone on.
     """
@@ -282,7 +283,7 @@ def clip_range(advantages: Tensor, clip_coef: float, c: float) -> Tensor:
 
 def surrogate(ratio: Tensor, advantages: Tensor, clip: Tensor) -> Tensor:
     """Returns the clipped objective of each sample (B,), to be maximised: the term inside the expectation of (2.14)."""
-    # Beyond its range a sample gains nothing more, but one that got worse keeps its gradient
+    # A ratio beyond its range has no gradient if it has moved as the advantage wants, and keeps it if not
     return torch.min(ratio * advantages, ratio.clamp(1 - clip, 1 + clip) * advantages)
 
 
@@ -299,8 +300,8 @@ def policy_change(logprobs, new_logprobs, actions, advantages) -> dict[str, Tens
     """Measures how far an update moved the policy on the B states of its rollout (the README defines each name).
 
     Args: log-probabilities of all actions before and after (B, A), the actions taken (B,), the advantages (B,),
-    normalised over the rollout. `kl` and the distances are exact over actions; the other three use the action taken,
-    as the thesis's chapter 4 does.
+    normalised over the rollout unless `norm_adv` is off. `kl` and the distances are exact over actions; the other three
+    use the action taken, as the thesis's chapter 4 does.
     """
     logratio = (new_logprobs - logprobs).gather(1, actions[:, None]).squeeze(1)
     ratio = logratio.exp()
@@ -321,8 +322,8 @@ def train(
 ) -> Agent:
     """Trains on `envs` as `args` say, afresh or from the checkpoint `state`; logs to `run` and returns the agent.
 
-    Ends early at `args.stop_at`, or when `stop` has noted a signal. Raises FloatingPointError at a loss or parameter
-    that is not finite, before it reaches a checkpoint.
+    Ends early at `args.stop_at`, or when `stop` has noted a signal. Raises FloatingPointError if a loss, a
+    parameter or a measure of the policy's change is not finite, before that reaches a checkpoint.
     """
     # Setup
     stop = stop or StopSignal()  # one that no signal reaches
@@ -334,11 +335,11 @@ def train(
     # eps as in OpenAI's baselines, not torch's 1e-8; fused: 1.3 ms a step, not 5.7 (benchmark/tricks.py)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     iterations_done = run.start(args, state, agent, optimizer)
-    run.save(args, iterations_done, agent, optimizer)  # so that a run can be resumed from its first moment on
-    new_policy = partial(make_policy, agent, args.seed)
+    run.save(args, iterations_done, agent, optimizer)  # so that a new run can be resumed at once, and this start counts
+    new_policy = partial(make_policy, agent, args.seed)  # a fresh generator for each film
     bookkeeping.record_game_if_due(args, new_policy, run, iterations_done)
 
-    # Storage: T steps of N environments. A rollout ends on row T of `obs` and `values`, which is row 0 of the next one.
+    # Storage: T steps of N environments. Row T follows them: its observations begin the next rollout.
     T, N = args.num_steps, args.num_envs
     next_obs, _ = envs.reset(seed=env_seeds(args.seed, N, run.num_starts))
     first_obs = from_envs(next_obs, device)
@@ -400,7 +401,7 @@ def train(
         minibatch_stats = []  # tensors, read once an iteration: .item() in here would wait for the device
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(args.batch_size, device=device).split(args.minibatch_size):
-                # index_select copies whole screens: 0.2 ms where b_obs[mb_inds] takes 3.3 ms
+                # index_select copies whole screens: 0.2 ms; b_obs[mb_inds] takes 3.3 ms
                 logits, new_values = agent(b_obs.index_select(0, mb_inds))
                 new_logprobs = logits.log_softmax(-1)
                 logratio = (new_logprobs - b_logprobs[mb_inds]).gather(1, b_actions[mb_inds, None]).squeeze(1)
@@ -423,12 +424,12 @@ def train(
                 with torch.no_grad():
                     approx_kl = ((ratio - 1) - logratio).mean()
                     clipfrac = ((ratio - 1).abs() > clip).float().mean()  # each sample against its own range
-                    avg_clip_ratio = clip.clamp(max=1).mean()  # no ratio falls by more than 1; a range can be infinite
+                    avg_clip_ratio = clip.clamp(max=1).mean()  # above 1 it never binds below; --c inf makes it infinite
                 stats = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "clipfrac": clipfrac}
                 stats |= {"avg_clip_ratio": avg_clip_ratio, "minibatch_approx_kl": approx_kl}
                 minibatch_stats.append(torch.stack(list(stats.values())).detach())
             if args.target_kl is not None:
-                epoch_kl = torch.stack(minibatch_stats[-args.num_minibatches :])[:, -1].mean()  # the last column
+                epoch_kl = torch.stack(minibatch_stats[-args.num_minibatches :])[:, -1].mean()  # minibatch_approx_kl
                 if epoch_kl > args.target_kl:
                     break
         stopwatch.lap("update")
@@ -456,7 +457,7 @@ def train(
         status_line.show(args, iteration, charts["charts/SPS"], run.last_scores)
 
         # Film and checkpoint
-        stopping = stop.number != 0  # read once: a signal after this line is served in the next iteration
+        stopping = stop.number != 0  # read once: a signal after this line is served after the next iteration
         if not stopping:
             bookkeeping.record_game_if_due(args, new_policy, run, iteration)
         if stopping or iteration == args.last_iteration or run.is_checkpoint_due():

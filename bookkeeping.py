@@ -1,9 +1,9 @@
-"""What surrounds the two algorithms: run directories, checkpoints, logging, signals, evaluation and videos.
+"""All that is not the algorithm: run directories, checkpoints, logging, signals, evaluation and videos.
 
-`open_run` decides what a call is to do and refuses what cannot work. `RunDirectory` holds a run's checkpoint, event
-files and `args.json`. `StopSignal`, `Stopwatch` and `StatusLine` accompany the loop, and `finish` ends the call: it
-evaluates the agent or says how to go on. Whole games are played by a policy that is passed in as a function, so this
-file knows no network and no loss.
+`open_run` chooses between training, resuming and evaluating, and refuses impossible calls. `RunDirectory` holds a run's
+checkpoint, event files and `args.json`. `StopSignal`, `Stopwatch` and `StatusLine` accompany the loop, and `finish`
+ends the call: it evaluates a finished agent, or says how to go on after a signal. Whole games are played by a policy
+that is passed in as a function, so this file knows no network and no loss.
 
 `benchmark/` uses the small helpers at the top. They cost no torch: it is imported in the functions that need it.
 """
@@ -79,7 +79,7 @@ def flag(name: str, value: object) -> str:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Replaces a file by UTF-8 text. It is written beside the file and renamed: one of the two is whole at any time."""
+    """Replaces a file by UTF-8 text: writes a new one beside it and renames that. One of the two is always whole."""
     new = f"{os.fspath(path)}.new"
     try:
         with open(new, "w", encoding="utf-8", newline="\n") as file:
@@ -95,8 +95,8 @@ def tune_process() -> None:
     """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
     # Idle OpenMP threads would spin on the cores that the games' threads need
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration: keeping
-    # them takes these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
+    # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping
+    # them cuts these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
     if hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-1, 1 << 30)
         if not libc.mallopt(-3, 1 << 30):
@@ -119,7 +119,7 @@ def bounded(kind: type, allow: Callable[[Any], bool], metavar: str, advice: str)
 
 PositiveInt = bounded(int, lambda x: 0 < x <= 10**12, "1..10^12", "a whole number from 1 to 10^12")
 NonNegativeInt = bounded(int, lambda x: 0 <= x < 2**64, "0..2^64-1", "a whole number from 0 to 2^64 - 1")
-# Below 1e30, because float32 must hold what is computed with them
+# Below 1e30, because float32 must hold the results
 PositiveFloat = bounded(float, lambda x: 0 < x < 1e30, ">0", "a number above 0 and below 1e30")
 NonNegativeFloat = bounded(float, lambda x: 0 <= x < 1e30, ">=0", "a number from 0 to below 1e30")
 NonNegativeOrInf = bounded(
@@ -156,7 +156,7 @@ class RunDirectory:
         self.lock = os.open(path, os.O_RDONLY)
         fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
         self.writer = None
-        self.waiting = False  # with what is logged, until a checkpoint could be written
+        self.waiting = False  # True after a failure, until a checkpoint could be written: drops what is logged
         self.not_written: set[str] = set()
         self.iteration = 0  # of the last checkpoint
         self.num_starts = 0  # each start of a run plays games of its own
@@ -172,8 +172,11 @@ class RunDirectory:
                 path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
                 with contextlib.suppress(FileExistsError):
                     os.makedirs(path)
-                    return cls(path)
+                    break
+            return cls(path)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                os.rmdir(path)  # made, but not to be locked
             refuse(flag("log_dir", args.log_dir), f"cannot be written ({error.strerror}); give another directory")
 
     @classmethod
@@ -228,7 +231,7 @@ class RunDirectory:
     def start(self, args, state: dict | None, agent, optimizer) -> int:
         """Starts afresh, or restores the checkpoint `state` into `agent` and `optimizer`; returns the iterations done.
 
-        The emulators' state is not saved, so a resumed run starts new games. What was logged after the checkpoint is
+        The emulators' state is not saved, so a resumed run starts new games. Points logged after the checkpoint are
         cut from the event files, for every reader of them.
         """
         import torch
@@ -303,7 +306,7 @@ class RunDirectory:
         progress = {"iteration": iteration, "global_step": iteration * args.batch_size}
         progress |= {"num_starts": self.num_starts + 1, "last_scores": list(self.last_scores)}
         learner = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"], "rng": rng}
-        self.write({"event_files": self.event_files(), "args": saved_args(args), **progress, **learner})
+        self.write({"args": saved_args(args), **progress, **learner})
         self.checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
 
     def is_checkpoint_due(self) -> bool:
@@ -316,9 +319,10 @@ class RunDirectory:
         new = self.checkpoint + ".new"
         with self.reporting("the checkpoint"):
             try:
+                event_files = self.event_files()
                 with open(new, "wb") as file:
-                    torch.save(state, file)
-                for name in (new, *(os.path.join(self.path, name) for name in self.event_files())):
+                    torch.save({"event_files": event_files, **state}, file)
+                for name in (new, *(os.path.join(self.path, name) for name in event_files)):
                     with open(name, "rb+") as file:  # on the disk before the rename is, even if the power fails
                         os.fsync(file.fileno())
                 os.replace(new, self.checkpoint)
@@ -390,7 +394,7 @@ class Stopwatch:
         self.last = now
 
     def end_iteration(self, batch_size: int) -> dict[str, float]:
-        """Returns the tags of an iteration of `batch_size` agent steps. What follows counts in the next one."""
+        """Returns the tags of an iteration of `batch_size` agent steps. Later time counts in the next one."""
         self.lap("rest")
         self.iteration_ends.append(self.last)
         sps = (len(self.iteration_ends) - 1) * batch_size / (self.iteration_ends[-1] - self.iteration_ends[0])
@@ -423,7 +427,7 @@ def saved_args(args) -> dict[str, object]:
 
 
 def command_line(args) -> str:
-    """Returns the command that repeats the run: what is not the default, and what decides most in any case."""
+    """Returns the command that repeats the run: all that is not the default, and always game, seed and threads."""
     words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], vars(type(args)())
     for name, value in saved_args(args).items():
         if value != defaults[name] or name in ("env_id", "seed", "threads"):
@@ -433,7 +437,7 @@ def command_line(args) -> str:
 
 
 def provenance() -> dict[str, object]:
-    """Returns what a reader needs to repeat a run besides its arguments: versions, commit, machine, threads."""
+    """Returns the versions, commit, machine and threads, which a reader needs beside the arguments to repeat a run."""
     import torch
 
     git = ["git", "-C", os.path.dirname(os.path.abspath(__file__)), "describe", "--always", "--dirty", "--abbrev=40"]
@@ -493,22 +497,26 @@ def record_game(args, policy: Policy, run: RunDirectory, step: int) -> None:
     path = os.path.join(run.path, "videos", f"step_{step}")
     with run.reporting("the video"):
         os.makedirs(os.path.dirname(path), exist_ok=True)
-        envs = make_envs(args.env_id, 1, args.threads, video=path + ".webm")
-        scores = [score for score, _ in play(policy, envs, 1, seed=[args.seed, 2])]
-        envs.close()
+        try:
+            with contextlib.closing(make_envs(args.env_id, 1, args.threads, video=path + ".webm")) as envs:
+                scores = [score for score, _ in play(policy, envs, 1, seed=[args.seed, 2])]
+        except OSError:
+            with contextlib.suppress(OSError):
+                os.remove(path + ".webm")
+            raise
         result = f"score_{scores[0]:.10g}" if scores else "without_end"
         os.replace(path + ".webm", f"{path}_{result}.webm")
 
 
 def record_game_if_due(args, new_policy: Callable[[], Policy], run: RunDirectory, iteration: int) -> None:
-    """Records a game at the start and at each quarter of the training, with `--capture-video`."""
+    """Records a game at the start, at each quarter and at the end of the training, with `--capture-video`."""
     if args.capture_video and iteration in [args.num_iterations * k // 4 for k in range(5)]:
         record_game(args, new_policy(), run, iteration * args.batch_size)
 
 
 # --------------------------------------------------------------------------------------------------- command line
 def open_run(args_class: type, description: str):
-    """Decides what this call is to do: train anew, resume, or evaluate. Refuses what cannot work, with status 2.
+    """Chooses between training anew, resuming and evaluating, and refuses impossible calls with status 2.
 
     Returns the arguments, the environments, the run, its checkpoint (None for a new run) and the stop signal.
     """
@@ -516,8 +524,7 @@ def open_run(args_class: type, description: str):
     threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
     args = tyro.cli(args_class, description=description)
     stop = StopSignal()
-    if args.evaluate is None:
-        stop.listen()
+    stop.listen(None if args.evaluate is None else signal.SIG_DFL)
     run = state = None
     name = "evaluate" if args.resume is None else "resume"
     if (directory := getattr(args, name)) is not None:
@@ -549,14 +556,17 @@ def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: Stop
     stop.listen(signal.SIG_DFL)  # there is nothing left to save
     step = run.iteration * args.batch_size
     stopped = stop.number != 0 and run.iteration < args.last_iteration
+    call = lambda *words: shlex.join([sys.executable, inspect.getfile(type(args)), *words])  # noqa: E731
     if stopped:
         stop_at = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
-        script = inspect.getfile(type(args))
-        say(f"Stopped; go on with: {shlex.join([sys.executable, script, '--resume', run.path, *stop_at])}")
+        say(f"Stopped; go on with: {call('--resume', run.path, *stop_at)}")
     elif args.evaluate is not None:
         evaluate(args, new_policy(), run, step)
         if args.capture_video:
             record_game(args, new_policy(), run, step)
-    elif run.iteration == args.num_iterations and args.eval_episodes > 0 and not stop.number and not run.not_written:
-        evaluate(args, new_policy(), run, step)
-    sys.exit(1 if run.not_written else 128 + stop.number if stopped else 0)
+    elif run.iteration == args.num_iterations and args.eval_episodes > 0:
+        if stop.number or run.not_written:
+            say(f"Finished, but not evaluated; do that with: {call('--evaluate', run.path)}")
+        else:
+            evaluate(args, new_policy(), run, step)
+    sys.exit(128 + stop.number if stopped else 1 if run.not_written else 0)

@@ -9,7 +9,6 @@ import sys
 import threading
 import time
 import warnings
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -151,6 +150,12 @@ class Process(subprocess.Popen):
 
     def __init__(self, script, *flags: str, cwd: Path, file_size: int | None = None):
         """Starts it; no file that it writes can grow beyond `file_size` bytes, as if the disk were full."""
+
+        def limit() -> None:
+            resource.setrlimit(resource.RLIMIT_CPU, (PATIENCE, PATIENCE))  # an endless run must not outlive its tests
+            if file_size is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
+
         super().__init__(
             [sys.executable, script.__file__, *flags],
             cwd=cwd,
@@ -158,7 +163,7 @@ class Process(subprocess.Popen):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=file_size and partial(resource.setrlimit, resource.RLIMIT_FSIZE, (file_size, file_size)),
+            preexec_fn=limit,
         )
 
     def wait_for(self, condition) -> None:

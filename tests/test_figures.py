@@ -492,6 +492,7 @@ def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_pa
 
     before = contents(default) | {"above": (tmp_path / "README.md").read_bytes()}
     call(monkeypatch, "--out", tmp_path / "other")
+    assert contents(default) | {"above": (tmp_path / "README.md").read_bytes()} == before
     assert (tmp_path / "other" / "figures" / "beginnings" / "kl.svg").exists()
     assert "| of my own |" in (tmp_path / "other" / "README.md").read_text(encoding="utf-8")
     shutil.rmtree(default / "runs")  # the rest from the CSVs alone

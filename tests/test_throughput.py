@@ -80,6 +80,7 @@ def test_the_split_shows_each_phase_and_what_no_phase_counts(tmp_path):
     run = throughput.measure(log_iterations(tmp_path, [1000, 1004, 1008], phases), start=1000, end=1008)
     header, _, line = cells(throughput.phase_table([Row(Contender("script", (), "", ""), 8, 2, 1, [[run]])]))
     shown = dict(zip(header, line))
+    assert header[4:] == ["iteration, ms", "environment", "update", "rest", "unaccounted"]
     assert shown["iteration, ms"] == "4000"
     assert shown["environment"] == "1000 (25.0%)"
     assert shown["rest"] == "250 (6.2%)"

@@ -243,6 +243,12 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
     return spec.kwargs["game"], 0.0
 
 
+def canonical_name(env_id: str) -> str:
+    """Returns a game's name as ale-py spells it (`pong`, `PONG` and `Pong-v5`'s kin are `Pong`); other ids stay."""
+    rom, repeat_action_probability = find_atari_game(env_id) or ("", None)
+    return atari_specs()[rom.replace("_", "")].name if repeat_action_probability == 0 else env_id
+
+
 def is_atari(spec: EnvSpec) -> bool:
     return spec.entry_point == "ale_py.env:AtariEnv"
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -96,7 +97,7 @@ def flags_of(**arguments) -> list[str]:
 
 
 class Ended(NamedTuple):
-    """How a call of a script ended; `err` is without the line a minute that says how far the run is."""
+    """How a call of a script ended; `err` is without the lines that say where a run is and how far."""
 
     status: int
     out: str
@@ -105,7 +106,7 @@ class Ended(NamedTuple):
     @classmethod
     def with_output(cls, status: int, out: str, err: str) -> "Ended":
         lines = err.splitlines(keepends=True)
-        return cls(status, out, "".join(line for line in lines if not line.startswith("step ")))
+        return cls(status, out, "".join(line for line in lines if not re.match(r"step |\S+: from step ", line)))
 
 
 @pytest.fixture

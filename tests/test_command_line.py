@@ -12,7 +12,7 @@ import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
-from bookkeeping import TENSORBOARD_LAYOUT, check
+from bookkeeping import TENSORBOARD_LAYOUT, check, commit_of, file_name
 from conftest import PATIENCE, ROOT, SHORT_CARTPOLE, SMALL, TINY_PIXELS, flags_of, run_dir_in, scalars
 
 
@@ -65,6 +65,36 @@ def test_two_runs_that_start_in_the_same_second_get_two_directories(script, tmp_
             names.append(Path(run.path).name)
     start = f"ALE-Breakout-v5__{args.exp_name}__1__"
     assert names == [start + second for second in ("1234567890", "1234567891", "1234567892")]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        ("pong", "Pong"),
+        ("PongNoFrameskip-v4", "Pong"),
+        ("name_this_game", "NameThisGame"),
+        ("CartPole-v1", "CartPole-v1"),
+    ],
+)
+def test_a_run_directory_has_the_game_in_its_one_spelling(script, env_id, name, tmp_path):
+    with contextlib.closing(script.RunDirectory.make(script.Args(env_id=env_id, log_dir=str(tmp_path)))) as run:
+        assert Path(run.path).name.split("__")[0] == name
+
+
+@pytest.mark.parametrize(("file", "name"), [("a/my ppo (2).py", "my-ppo--2-"), ("ppo_atari.py", "ppo_atari")])
+def test_a_script_s_runs_are_named_after_its_file(file, name):
+    assert file_name(file) == name
+
+
+def test_the_commit_is_this_checkout_s_and_dirty_for_a_script_that_it_does_not_hold(tmp_path, monkeypatch):
+    monkeypatch.setenv("GIT_DIR", str(tmp_path))  # of another repository, as in a git hook
+    commit = commit_of(acppo_atari.__file__)
+    assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?", commit) or commit.startswith("unknown (")
+    if not commit.startswith("unknown ("):
+        (tmp_path / "my_ppo.py").write_text("")
+        assert commit_of(str(tmp_path / "my_ppo.py")) == commit.removesuffix("-dirty") + "-dirty"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert commit_of(acppo_atari.__file__).startswith("unknown (")  # git is not installed
 
 
 def test_help_explains_every_flag(script, monkeypatch, call_main):

@@ -107,16 +107,27 @@ def processes(out: Path) -> dict[str, list[int]]:
 
 # ------------------------------------------------------------------------------- one grid, interrupted and gone on with
 @pytest.fixture(scope="module")
-def grid(tmp_path_factory):
+def cluster():
+    """The address of a Ray cluster with two cores, however many there are. To start one takes seconds."""
+    from ray.cluster_utils import Cluster
+
+    cores = {"num_cpus": 2, "object_store_memory": 100_000_000, "include_dashboard": False}
+    cluster = Cluster(initialize_head=True, head_node_args=cores)
+    yield cluster.address
+    cluster.shutdown()
+
+
+@pytest.fixture(scope="module")
+def grid(tmp_path_factory, cluster):
     """Interrupts two runs, then takes one of them two iterations further, beside a game that does not exist."""
     out = tmp_path_factory.mktemp("grid")
-    driver = start(out, "--games", "CartPole-v1")
+    driver = start(out, "--games", "CartPole-v1", "--address", cluster)
     wait_for(lambda: both_log(out))
     status, said = interrupt(driver)
     interrupted = {name: (global_step(path), steps(path)) for name, path in run_dirs(out).items()}
     left = processes(out)
     goal = interrupted["CartPole-v1__ppo__1"][0] + 2048
-    flags = ("--games", "CartPole-v1", "Brekout", "--variants", "ppo", "--stop-at", str(goal))
+    flags = ("--games", "CartPole-v1", "Brekout", "--variants", "ppo", "--stop-at", str(goal), "--address", cluster)
     again = subprocess.run(grid_command(out, *flags), cwd=out, capture_output=True, text=True, timeout=GUARD)
     return out, (status, said, interrupted, left), goal, again
 

@@ -571,14 +571,18 @@ def record_game_if_due(
 
 # --------------------------------------------------------------------------------------------------- command line
 def parse(args_class: type, **given):
-    """Parses the command line. What tyro prints before it ends the program may find no reader, which is no failure."""
+    """Parses the command line. `--help` that has no reader, or no letter for ε, is no failure."""
+    if sys.stdout is None:  # closed before Python started
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+    sys.stdout.reconfigure(errors="replace")
     try:
-        return tyro.cli(args_class, **given)
-    finally:
         try:
+            return tyro.cli(args_class, **given)
+        finally:
             sys.stdout.flush()
-        except OSError:  # Python would flush again at its end, and fail
-            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    except OSError:  # Python would flush again at its end, and fail
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit()
 
 
 def open_run(args_class: type, description: str):

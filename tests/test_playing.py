@@ -334,7 +334,10 @@ def test_a_result_that_nobody_reads_is_no_failure(script, tmp_path, call_main):
     for flags in (["--evaluate", str(tmp_path / "run"), "--eval-episodes", "2"], ["--help"]):
         command = [sys.executable, script.__file__, *flags]
         with open("/dev/full", "w") as full:
-            ended = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE)
+            ascii_alone = {**os.environ, "PYTHONIOENCODING": "ascii"}
+            ended = subprocess.run(
+                command, env=ascii_alone, stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE
+            )
         assert (ended.returncode, ended.stderr) == (0, "")
 
 

@@ -234,9 +234,9 @@ class Row:
 
 
 def read_iterations(directory: Path) -> list[Iteration]:
-    """Reads the event file somewhere under `directory`; an iteration ends when `charts/SPS` is logged."""
-    file = next(directory.rglob("events.out.tfevents*"), directory)
-    reader = EventAccumulator(str(file), size_guidance={"scalars": 0})  # 0: every point
+    """Reads the run somewhere under `directory`; an iteration ends when `charts/SPS` is logged."""
+    run = next(directory.rglob("events.out.tfevents*"), directory / "none").parent
+    reader = EventAccumulator(str(run), size_guidance={"scalars": 0})  # 0: every point
     reader.Reload()
     if "charts/SPS" not in (logged := reader.Tags()["scalars"]):
         return []

@@ -204,8 +204,8 @@ an evaluation draws from the training's random numbers | both scripts | test_pla
 +act(agent, from_envs(obs, device))
 
 an evaluation plays the games that the training began with | bookkeeping.py | test_playing.py -k other_games_than
--seed=[args.seed, 1])
-+seed=[args.seed])
+-[args.seed, 1], stop)
++[args.seed], stop)
 
 a run is finished only at a step that no whole rollout reaches | benchmark/atari5.py | test_atari5.py -k whole_rollout
 -min(args.total_timesteps // rollout * rollout,

@@ -75,7 +75,7 @@ def tell(text: str) -> None:
 
 
 def refuse(given: str, advice: object) -> typing.NoReturn:
-    """Ends the program with status 2 and one line: what was given, and what to do."""
+    """Ends the program with status 2 and one line: the refused input, and the advice."""
     say(" ".join(f"{given}: {advice}".split()))
     sys.exit(2)
 
@@ -86,7 +86,7 @@ def flag(name: str, value: object) -> str:
 
 
 def file_name(script: str) -> str:
-    """Returns a name for a script's runs: that of its file, without what is unfit for a directory's name."""
+    """Returns a name for a script's runs: that of its file, without characters unfit for a directory's name."""
     return re.sub(r"[^\w.-]", "-", os.path.basename(script).removesuffix(".py"))[:100] or "run"
 
 
@@ -170,7 +170,7 @@ class RunDirectory:
         self.lock = os.open(path, os.O_RDONLY)
         fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
         self.writer = None
-        self.waiting = False  # True after a failure, until a checkpoint could be written: drops what is logged
+        self.waiting = False  # True after a failure, until a checkpoint could be written; points are dropped meanwhile
         self.not_written: set[str] = set()
         self.iteration = 0  # of the last checkpoint
         self.num_starts = 0  # each start of a run plays games of its own

@@ -1,4 +1,4 @@
-"""What several test files share: the scripts, in this process and in their own, and what a run has logged."""
+"""Helpers of several test files: the scripts, in this process and in their own, and the logs of a run."""
 
 import contextlib
 import os
@@ -25,7 +25,7 @@ from wrappers import make_envs
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {"ppo": ppo_atari, "acppo": acppo_atari}
-MEASURED_IN_SECONDS = ("charts/SPS", "time/")  # what two equal runs do not share
+MEASURED_IN_SECONDS = ("charts/SPS", "time/")  # two equal runs differ in these
 TINY_PIXELS = "tiny_envs:TinyPixels-v0"
 SHORT_CARTPOLE = "tiny_envs:ShortCartPole-v0"
 SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
@@ -44,7 +44,7 @@ def each_script(request):
     return request.param
 
 
-# ------------------------------------------------------------------------------------------- what a run leaves behind
+# ---------------------------------------------------------------------------------------------- the logs of a run
 def scalars(run_dir) -> dict[str, list[tuple[int, float]]]:
     """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points.
 
@@ -83,7 +83,7 @@ def open_run(script, path):
 
 
 def train(script, run_dir, **arguments) -> dict[str, list[tuple[int, float]]]:
-    """Trains without the checks of the command line, and returns what was logged."""
+    """Trains without the checks of the command line, and returns the logged scalars."""
     args = script.Args(**{"threads": 1, **arguments})
     run_dir = Path(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)

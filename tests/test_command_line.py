@@ -1,4 +1,4 @@
-"""The scripts as a user runs them: smoke runs as processes, what they log, and how bad input is refused."""
+"""The scripts as a user runs them: smoke runs as processes, their curves, and refusals of bad input."""
 
 import contextlib
 import math
@@ -23,7 +23,7 @@ def documented_tags() -> set[str]:
 
 
 def check_a_run_of_two_iterations(script, env_id: str, run_dir: Path) -> None:
-    """Asserts that it has logged every documented tag with finite values, and said what it is."""
+    """Asserts that it has logged every documented tag with finite values, and described itself."""
     exp_name = Path(script.__file__).stem
     assert re.fullmatch(rf"{re.escape(env_id.replace(':', '-'))}__{exp_name}__1__\d+", run_dir.name)
     logged = scalars(run_dir)
@@ -108,7 +108,7 @@ def test_help_explains_every_flag(script, monkeypatch, call_main):
 
 
 REFUSED = [
-    # (flags, the flag that is named, what is said)
+    # (flags, the flag that is named, the advice)
     (["--env-id", "Brekout"], "--env-id Brekout", "did you mean Breakout"),
     (["--env-id", "Brek\nout"], "--env-id Brek out", "unknown environment"),
     (["--env-id", "Pendulum-v1"], "--env-id Pendulum-v1", "only Discrete actions"),
@@ -134,7 +134,7 @@ def test_what_cannot_be_parsed_is_refused_too(script, tmp_path, call_main):
 
 NAN, INF = math.nan, math.inf
 BOUNDS = [
-    # (arguments, values that are refused, what is said, values that are not)
+    # (arguments, refused values, the advice, accepted values)
     (
         "total_timesteps num_envs num_steps num_minibatches update_epochs",
         [0, -1, 10**12 + 1],

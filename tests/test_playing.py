@@ -103,7 +103,7 @@ def test_games_are_repeated_by_their_seed_and_leave_torchs_generator_alone(scrip
     ],
 )
 def test_training_is_the_same_with_and_without_videos_and_evaluation(script, env_id, tmp_path, monkeypatch, call_main):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # pygame complains without, where there is no desktop
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # pygame complains without it if there is no desktop
     flags = flags_of(env_id=env_id, num_envs=2, num_steps=16, total_timesteps=128, update_epochs=1, threads=1)
     logged = []
     for name, extra in (("with", ["--capture-video", "--eval-episodes", "3"]), ("without", ["--eval-episodes", "0"])):
@@ -253,7 +253,7 @@ def test_the_video_of_a_game_that_does_not_end_has_no_score(script, tmp_path, mo
 
 @pytest.mark.parametrize("env_id", [RENDERED, pytest.param("Breakout", marks=pytest.mark.slow)])
 def test_a_video_that_the_disk_has_no_room_for_is_reported(script, env_id, tmp_path, capfd):
-    """No file may grow beyond half a video's size, which is what the disk says when it is full."""
+    """No file may grow beyond half a video's size: writes fail as on a full disk."""
     assert recorded(script, tmp_path, env_id)
     (video,) = tmp_path.glob("videos/step_7_score_*.webm")
     size = video.stat().st_size

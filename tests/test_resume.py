@@ -100,7 +100,7 @@ def test_a_resumed_run_plays_games_that_it_has_not_played(script, tmp_path, monk
 
 
 def killed_and_resumed(script, tmp_path, start, call_main, kills: int) -> dict:
-    """Kills a run with SIGKILL at random instants, resumes it each time, and returns what was logged.
+    """Kills a run with SIGKILL at random instants, resumes it each time, and returns the logged scalars.
 
     A checkpoint is due after every iteration, so that many kills fall into the writing of one; none may lose more than
     the iteration in progress.
@@ -373,7 +373,7 @@ def bytes_after(script, directory: Path, iterations: int) -> tuple[int, int]:
     ],
 )
 def test_a_full_disk_is_said_once_and_training_goes_on(script, too_large, tmp_path, start):
-    """No file may grow beyond a limit, which is what the disk says when it is full."""
+    """No file may grow beyond a limit: writes fail as on a full disk."""
     first, events_before = bytes_after(script, tmp_path / "measured 0", 0)
     later, events_after = bytes_after(script, tmp_path / "measured 5", 5)
     iterations = 5
@@ -438,7 +438,7 @@ names = st.sampled_from(
     ["CartPole-v1", "Acrobot-v1", TINY_PIXELS, "Brekout", "Pendulum-v1", "a:b:c", "", "\n", "ALE/", "-"]
 )
 NUMBERS = "learning_rate gamma gae_lambda clip_coef vf_clip_coef ent_coef vf_coef max_grad_norm target_kl seed".split()
-ODD = {  # what any flag might be given
+ODD = {  # odd values for any flag
     **dict.fromkeys(("num_envs", "num_steps", "num_minibatches", "update_epochs"), sizes),
     **dict.fromkeys((*NUMBERS, "checkpoint_minutes", "stop_at"), numbers),
     "total_timesteps": st.integers(-1, 700),

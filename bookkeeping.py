@@ -11,7 +11,6 @@ that is passed in as a function, so this file knows no network and no loss.
 import contextlib
 import csv
 import ctypes
-import fcntl
 import hashlib
 import importlib.metadata
 import inspect
@@ -22,6 +21,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -35,6 +35,7 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Annotated, Any
 
+import filelock
 import numpy as np
 import tyro
 from gymnasium.vector import VectorEnv
@@ -65,13 +66,13 @@ def say(text: str, end: str = "\n") -> None:
     start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
     with contextlib.suppress(OSError):
         if sys.stderr is not None:  # None: closed before Python started, and 2 may be a file of ours
-            os.write(2, (start + text + end).encode())
+            os.write(2, (start + text + end).encode(errors="replace"))
 
 
 def tell(text: str) -> None:
     """Writes to standard output and ignores errors: a result that nobody reads is no failure."""
     with contextlib.suppress(OSError):
-        os.write(1, (text + "\n").encode())
+        os.write(1, (text + "\n").encode(errors="replace"))
 
 
 def refuse(given: str, advice: object) -> typing.NoReturn:
@@ -165,10 +166,16 @@ class RunDirectory:
     """A run's checkpoint and event files, held by one process at a time. A full disk costs points, not the run."""
 
     def __init__(self, path: str):
-        """Opens an existing directory. Raises OSError; BlockingIOError if another process holds it."""
+        """Opens an existing directory. Raises OSError; filelock.Timeout if another process holds it.
+
+        One that cannot be written, on a read-only file system for example, is opened for evaluations, without a lock.
+        """
+        os.listdir(path)
         self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
-        self.lock = os.open(path, os.O_RDONLY)
-        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
+        # On a file, because NFS does not pass locks on directories on. The lock dies with its process, the file stays.
+        self.lock = filelock.FileLock(os.path.join(path, "run.lock"))
+        if os.access(path, os.W_OK):
+            self.lock.acquire(blocking=False)
         self.writer = None
         self.waiting = False  # True after a failure, until a checkpoint could be written; points are dropped meanwhile
         self.not_written: set[str] = set()
@@ -203,7 +210,7 @@ class RunDirectory:
                 raise ValueError("it cannot be written")
             run = cls(path)
             return run, run.load(args_class)
-        except BlockingIOError:
+        except filelock.Timeout:
             refuse(flag(name, path), "another process holds it; wait for its end")
         except (OSError, ValueError) as error:
             refuse(flag(name, path), getattr(error, "strerror", None) or error)
@@ -212,7 +219,7 @@ class RunDirectory:
         """Lets go of the directory, for another process or object to open it."""
         if self.writer is not None:
             self.writer.close()
-        os.close(self.lock)
+        self.lock.release()
 
     def load(self, args_class: type) -> dict:
         """Returns the checkpoint. Raises ValueError if there is none, or none of a script with these arguments."""
@@ -277,7 +284,8 @@ class RunDirectory:
         about = {
             "command": command_line(args),
             "started_at_step": step,  # above 0 for a resumed run, which the command does not repeat
-            "args": saved_args(args),
+            # JSON has no infinity
+            "args": {name: str(value) if value == math.inf else value for name, value in saved_args(args).items()},
             "provenance": provenance(inspect.getfile(type(args))),
         }
         with self.reporting("args.json"):
@@ -310,7 +318,7 @@ class RunDirectory:
         """
         from torch.utils.tensorboard import SummaryWriter
 
-        with self.reporting("the evaluation"):
+        with self.reporting("the evaluation", then=""):
             with SummaryWriter(self.path, filename_suffix=".eval") as writer:
                 for name, value in stats.items():
                     writer.add_scalar(f"eval/{name}", value, step)
@@ -348,7 +356,10 @@ class RunDirectory:
                     with open(name, "rb+") as file:  # on the disk before the rename is, even if the power fails
                         os.fsync(file.fileno())
                 os.replace(new, self.checkpoint)
-                os.fsync(self.lock)
+                with contextlib.suppress(OSError):  # not every file system can; nothing is lost if it works without
+                    directory = os.open(self.path, os.O_RDONLY)
+                    os.fsync(directory)
+                    os.close(directory)
                 self.iteration, self.waiting = state["iteration"], False
             except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
                 with contextlib.suppress(OSError):
@@ -369,13 +380,13 @@ class RunDirectory:
             raise
 
     @contextlib.contextmanager
-    def reporting(self, what: str) -> Iterator[None]:
-        """Says once that `what` cannot be written, and lets the run go on."""
+    def reporting(self, what: str, then: str = "; the run goes on") -> Iterator[None]:
+        """Says once that `what` cannot be written, and goes on."""
         try:
             yield
         except OSError as error:
             if what not in self.not_written:
-                say(f"{self.path}: {what} cannot be written ({error}); the run goes on")
+                say(f"{self.path}: {what} cannot be written ({error}){then}")
             self.not_written.add(what)
 
     def event_files(self) -> dict[str, int]:
@@ -444,6 +455,7 @@ class StatusLine:
         step, last_step = iteration * args.batch_size, args.last_iteration * args.batch_size
         line = f"step {step:,} of {last_step:,}, {sps:.0f} SPS{score}, {left} left"
         if os.isatty(2):
+            line = line[: shutil.get_terminal_size().columns - 1]  # a line that wraps cannot be written over
             say(line, end="\n" if iteration == args.last_iteration else "")
         elif time.perf_counter() >= self.due:
             say(line)
@@ -461,7 +473,10 @@ def command_line(args) -> str:
     for name, value in saved_args(args).items():
         if value != defaults[name] or name in ("env_id", "seed", "threads"):
             words.append(f"--{'no-' if value is False else ''}{name.replace('_', '-')}")
-            words += [] if isinstance(value, bool) else [str(value)]
+            if str(value).startswith("-"):  # a flag of its own, otherwise
+                words[-1] += f"={value}"
+            elif not isinstance(value, bool):
+                words.append(str(value))
     return shlex.join(words)
 
 
@@ -523,7 +538,8 @@ def play(
         obs, _, _, _, infos = envs.step(policy(obs))
         for n in np.flatnonzero(infos.get("_episode", False)):
             games[n].append((float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
-    return [game for played, share in zip(games, shares, strict=True) for game in played[:share]]
+    numbered = (divmod(number, envs.num_envs) for number in range(num_games))
+    return [games[n][turn] for turn, n in numbered if turn < len(games[n])]
 
 
 def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal | None = None) -> None:
@@ -531,7 +547,7 @@ def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSigna
     import torch
 
     torch.set_num_threads(args.threads)
-    envs = make_envs(args.env_id, min(args.num_envs, args.eval_episodes), args.threads)
+    envs = make_envs(args.env_id, args.num_envs, args.threads)  # however many games: so each has its number
     games = play(policy, envs, args.eval_episodes, [args.seed, 1], stop)
     envs.close()
     if stop is not None and stop.number:

@@ -97,7 +97,8 @@ class Args:
     cuda: bool = True
     """use a GPU if there is one"""
     threads: Threads = field(default_factory=bookkeeping.available_cores)
-    """threads of torch; the emulators use as many, in turn with it. The default is the cores this process may use"""
+    """threads of torch; the emulators use as many, in turn with it. The default is the cores that this process may use;
+    in a container with a CPU quota, which it does not see, give the quota"""
     bf16: bool = False
     """run the network's trunk in bfloat16 (ours): faster on processors with AVX512-BF16 or AMX, far slower on others;
     parameters, logits, values and losses stay float32"""
@@ -468,10 +469,10 @@ def main() -> None:
         else:
             agent = make_agent(args, envs)
             run.restore_agent(state, agent)
+        bookkeeping.finish(args, partial(make_policy, agent, args.seed), run, stop)
     except FloatingPointError as error:
         say(f"{run.path}: {error}")
         sys.exit(1)
-    bookkeeping.finish(args, partial(make_policy, agent, args.seed), run, stop)
 
 
 if __name__ == "__main__":

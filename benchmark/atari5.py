@@ -5,7 +5,8 @@
     python benchmark/atari5.py --address auto --out /shared/results  # on the nodes of a Ray cluster
 
 The same command again goes on: finished runs are skipped, others are resumed from their checkpoints. A run that fails
-is resumed once, then reported, and the rest goes on; the runs of a node that dies go on elsewhere; Ctrl-C leaves every run resumable. With a larger `--stop-at` the same curves become longer.
+is resumed once, then reported, and the rest goes on; the runs of a node that dies go on elsewhere; Ctrl-C leaves every
+run resumable. With a larger `--stop-at` the same curves become longer.
 
 Each run is one process of a script, started by a Ray task (`pip install -e '.[benchmark]'`). OUT/runs gets the runs'
 own directories, OUT/logs what each of them was started with and has printed. Exit status: 0 all done, 1 some failed,
@@ -277,8 +278,9 @@ def run_grid(runs: list[Run], args: Args) -> None:
     try:
         try:
             ray.init(args.address or "local", **quiet, **({} if args.address else cores))
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            refuse(f"--address {args.address or 'local'}", f"Ray does not start there ({str(error).splitlines()[0]})")
+        except (OSError, ValueError, RuntimeError) as error:
+            advice = "" if args.address else "; set RAY_TMPDIR or TMPDIR to a short path that can be written"
+            refuse(f"--address {args.address or 'local'}", f"Ray does not start ({str(error).splitlines()[0]}){advice}")
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # after init, which sets the second
             if signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets the third
                 signal.signal(number, signal.default_int_handler)

@@ -134,7 +134,7 @@ def pairs(curves: Curves, game: str) -> list[tuple[pd.DataFrame, pd.DataFrame]]:
 def epsilons(runs: pd.DataFrame) -> dict[str, float]:
     """Returns each variant's ε, its widest clip range; with c = inf the range has no bound, and it has none here."""
     arguments = {run.variant: json.loads(run.arguments) for run in runs.itertuples()}
-    return {name: args["clip_coef"] for name, args in arguments.items() if math.isfinite(args.get("c", 0))}
+    return {name: args["clip_coef"] for name, args in arguments.items() if math.isfinite(float(args.get("c", 0)))}
 
 
 # -------------------------------------------------------------------------------------------------- statistics

@@ -1,18 +1,23 @@
 """The scripts as a user runs them: smoke runs as processes, their curves, and refusals of bad input."""
 
 import contextlib
+import json
 import math
 import re
+import shlex
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+import tyro
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
-from bookkeeping import TENSORBOARD_LAYOUT, check, commit_of, file_name
+from bookkeeping import TENSORBOARD_LAYOUT, check, command_line, commit_of, file_name
 from conftest import PATIENCE, ROOT, SHORT_CARTPOLE, SMALL, TINY_PIXELS, flags_of, run_dir_in, scalars
 
 
@@ -79,6 +84,40 @@ def test_two_runs_that_start_in_the_same_second_get_two_directories(script, tmp_
 def test_a_run_directory_has_the_game_in_its_one_spelling(script, env_id, name, tmp_path):
     with contextlib.closing(script.RunDirectory.make(script.Args(env_id=env_id, log_dir=str(tmp_path)))) as run:
         assert Path(run.path).name.split("__")[0] == name
+
+
+ARGUMENTS = st.fixed_dictionaries(
+    {},
+    optional={
+        "env_id": st.text(min_size=1),
+        "log_dir": st.text(min_size=1),
+        "exp_name": st.from_regex(r"[A-Za-z0-9_.-]{1,20}", fullmatch=True),
+        "seed": st.integers(0, 2**64 - 1),
+        "gamma": st.floats(0, 1),
+        "c": st.one_of(st.just(math.inf), st.floats(0, 1e29)),
+        "target_kl": st.one_of(st.none(), st.floats(1e-300, 1e29)),
+        "norm_adv": st.booleans(),
+        "capture_video": st.booleans(),
+    },
+)
+
+
+@settings(deadline=None, database=None)
+@given(ARGUMENTS)
+def test_the_recorded_command_is_parsed_to_the_same_arguments(arguments):
+    args = acppo_atari.Args(**arguments)
+    python, script, *words = shlex.split(command_line(args))
+    assert (python, script) == ("python", "acppo_atari.py") and tyro.cli(acppo_atari.Args, args=words) == args
+
+
+def test_the_record_of_a_run_is_strict_json(tmp_path, call_main):
+    call_main(acppo_atari, *flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=128, eval_episodes=0, c="inf"))
+    text = (run_dir_in(tmp_path / "runs") / "args.json").read_text(encoding="utf-8")
+
+    def refuse(constant):
+        raise ValueError(constant)
+
+    assert json.loads(text, parse_constant=refuse)["args"]["c"] == "inf"
 
 
 @pytest.mark.parametrize(("file", "name"), [("a/my ppo (2).py", "my-ppo--2-"), ("ppo_atari.py", "ppo_atari")])

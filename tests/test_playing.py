@@ -74,7 +74,7 @@ class LastsAsLongAsItsNumber(VectorWrapper):
 
 
 @pytest.mark.parametrize(
-    ("num_games", "scores"), [(4, [0, 1, 2, 3]), (6, [0, 0, 1, 1, 2, 3]), (9, [0] * 3 + [1] * 2 + [2] * 2 + [3] * 2)]
+    ("num_games", "scores"), [(4, [0, 1, 2, 3]), (6, [0, 1, 2, 3, 0, 1]), (9, [0, 1, 2, 3] * 2 + [0])]
 )
 def test_every_environment_plays_its_share_however_short_its_games(script, num_games, scores):
     envs = LastsAsLongAsItsNumber(make_envs("CartPole-v1", 4))
@@ -311,14 +311,27 @@ def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, monkeyp
         "step 1,800 of 2,000, 50 SPS, score 1.5, 0:00:04 left\n"
     )
     monkeypatch.setattr(os, "isatty", lambda descriptor: True)
+    monkeypatch.setenv("COLUMNS", "45")
     line.show(args, 19, sps=50.0, last_scores=[])
     line.show(args, 20, sps=50.0, last_scores=[])
     clear = "\r\x1b[K"
     shown = f"{clear}step 1,900 of 2,000, 50 SPS, 0:00:02 left{clear}step 2,000 of 2,000, 50 SPS, 0:00:00 left\n"
     assert capfd.readouterr().err == shown
+    monkeypatch.setenv("COLUMNS", "20")
+    line.show(args, 19, sps=50.0, last_scores=[])
+    assert capfd.readouterr().err == f"{clear}step 1,900 of 2,000"
     monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it if the shell closed it: 2>&-
     line.show(args, 20, sps=50.0, last_scores=[])
     assert capfd.readouterr().err == ""
+
+
+def test_a_game_of_an_evaluation_is_the_same_however_many_are_played(script, tmp_path, call_main):
+    train(script, tmp_path / "run", **CARTPOLE, total_timesteps=128)
+    for num_games in ("1", "3", "6", "10"):
+        assert call_main(script, "--evaluate", "run", "--eval-episodes", num_games).status == 0
+    with open(tmp_path / "run" / "eval.csv", encoding="utf-8") as file:
+        games = [(row["game"], row["score"]) for row in csv.DictReader(file)]
+    assert len(games) == 20 and len(set(games)) == 10
 
 
 def test_another_seed_evaluates_other_games(script, tmp_path, call_main):

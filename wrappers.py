@@ -11,8 +11,10 @@ PPO then trains on.
 
 import contextlib
 import difflib
+import importlib.metadata
 import os
 import re
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 
@@ -21,10 +23,11 @@ import gymnasium as gym
 import numpy as np
 from ale_py.vector_env import AtariVectorEnv
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatdim
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.wrappers import (
     DtypeObservation,
+    FlattenObservation,
     FrameStackObservation,
     GrayscaleObservation,
     ReshapeObservation,
@@ -34,10 +37,12 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 
 gym.register_envs(ale_py)
+OWN_IDS = set(gym.registry)  # Gymnasium's and ale-py's; other packages add theirs later
 
 FRAME_SKIP = 4  # emulator frames shown for each agent step
 SCREEN = (84, 84)  # height and width of an observation, pixels
 STACK = 4  # most recent screens in an observation
+SMALLEST_SCREEN = 36  # height and width from which on uint8 observations are screens: the least that the CNN takes
 
 
 # ------------------------------------------------------------------------------------------------- environments
@@ -49,7 +54,7 @@ def make_envs(
     Args:
         env_id: an Atari game (`Breakout`, `breakout`, `BreakoutNoFrameskip-v4`: the thesis's protocol, without sticky
             actions; `ALE/Breakout-v5`: the same with its registered sticky actions), or any other registered
-            Gymnasium id, `module:Env-v0` included.
+            Gymnasium id, `module:Env-v0` included: the module may lie in the current directory.
         num_envs: the number of copies N.
         num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
         max_frames: emulator frames after which an Atari game is truncated, counted from the end of its no-ops.
@@ -57,14 +62,17 @@ def make_envs(
 
     Returns:
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
-        float32 (N, D) for flat ones. Rewards: sign-clipped for Atari, as they are elsewhere.
+        float32 (N, D) for all others. Rewards: float32 signs for Atari, as they are elsewhere.
         After a step in which games have ended, and no other, `info["_episode"]` (N,) is true for those and
         `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; where one was
         truncated, `info["final_obs"]` holds the observation that it ended on (other rows are not to be read).
 
     Raises:
-        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
+        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported, or
+            `num_envs` is not a whole number above 0.
     """
+    if not isinstance(num_envs, int) or num_envs < 1:  # ale-py kills the process on 0
+        raise ValueError(f"num_envs is {num_envs!r}; give a whole number above 0")
     if (atari := find_atari_game(env_id)) is None:
         return make_gymnasium_envs(env_id, num_envs, video)
     rom, repeat_action_probability = atari
@@ -89,7 +97,7 @@ def make_envs(
         envs = RecordVideo(envs, video, 60 / FRAME_SKIP, twin)
     envs = RecordEpisodeStatistics(envs)  # above EpisodicLife it would count lives, above the sign clipped rewards
     envs = EpisodicLife(envs)
-    return TransformReward(envs, np.sign)
+    return TransformReward(envs, lambda rewards: np.sign(rewards).astype(np.float32))
 
 
 def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int]:
@@ -257,13 +265,16 @@ def atari_specs() -> dict[str, EnvSpec]:
 
 def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) -> VectorEnv:
     """Builds `make_envs`'s vector environment for an id that is not Atari. Raises ValueError as `make_envs` does."""
+    parts = re.fullmatch(r"((?:\w+(?:\.\w+)*:)?)([\w/.-]+)", env_id)
+    if parts is None:
+        raise ValueError(suggest("", env_id))
+    prefix, name = parts.groups()  # "module:" or nothing, and the id
     try:
-        if not re.fullmatch(r"(\w+(\.\w+)*:)?[\w/.-]+", env_id):
-            raise gym.error.UnregisteredEnv
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "out of date": the id was chosen, or is refused below in one line
+            import_registrations(prefix[:-1], name)
             envs = gym.make_vec(
-                env_id,
+                name,
                 num_envs,
                 vectorization_mode="sync",
                 vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
@@ -274,49 +285,87 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
             if video is not None and envs.render()[0] is None:
                 raise ValueError("no video can be made of it, it does not render to rgb_array")
     except gym.error.UnregisteredEnv as error:
-        names = [spec.name for spec in atari_specs().values()]
-        names += [spec.id for spec in gym.registry.values() if spec.namespace is None and not is_atari(spec)]
-        by_lower = {name.lower(): name for name in names}
-        close = [by_lower[name] for name in difflib.get_close_matches(env_id.lower(), by_lower, n=3)]
-        hint = f"did you mean {' or '.join(close)}?" if close else "use a game such as Breakout, or CartPole-v1"
-        raise ValueError(f"unknown environment; {hint}") from error
-    except UnsupportedSpace:
+        raise ValueError(suggest(prefix, name)) from error
+    except Refused:
         raise
     except Exception as error:  # whatever a foreign constructor raises
         verb = "built" if video is None else "rendered"
-        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}") from error
+        reason = str(error).replace("use `", f"use `{prefix}") or type(error).__name__  # Gymnasium, of another version
+        raise ValueError(f"it cannot be {verb}: {reason}") from error
     if video is not None:
         envs = RecordVideo(envs, video, envs.metadata.get("render_fps", 30))
     return RecordEpisodeStatistics(envs)
 
 
-class UnsupportedSpace(ValueError):
-    """Observations or actions that the scripts have no network for."""
+class Refused(ValueError):
+    """A module that cannot be imported, or observations or actions that the scripts have no network for."""
+
+
+def import_registrations(module: str, name: str) -> None:
+    """Imports an id's module, if it has one, and makes the calls that packages declare for registering environments.
+
+    They are entry points `gymnasium.envs`, named after a namespace: Gymnasium made these calls itself before 1.0.
+    """
+    if module:
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())  # last, so that nothing in it hides a package
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # whatever a foreign module raises
+            advice = "install its package, or start in the directory that it lies in"
+            raise Refused(f"module {module} cannot be imported: {type(error).__name__}: {error}; {advice}") from error
+    if name not in gym.registry:
+        package, namespace = module.split(".")[0], name.rpartition("/")[0]
+        for entry_point in importlib.metadata.entry_points(group="gymnasium.envs"):
+            if entry_point.module.split(".")[0] == package or entry_point.name == namespace:
+                entry_point.load()()
+
+
+def suggest(prefix: str, name: str) -> str:
+    """Says that an id, of a module or none, is unknown, and what to write instead."""
+    names = [] if prefix else [spec.name for spec in atari_specs().values()]
+    for known, spec in gym.registry.items():
+        if known not in OWN_IDS or not (prefix or spec.namespace or is_atari(spec)):
+            names.append(known)
+    by_lower = {known.lower(): known for known in names}
+    close = [prefix + by_lower[known] for known in difflib.get_close_matches(name.lower(), by_lower, n=3)]
+    said = f"module {prefix[:-1]} was imported, but registers no {name}" if prefix else "unknown environment"
+    if close:
+        return f"{said}; did you mean {' or '.join(close)}?"
+    if prefix:
+        return f"{said}; if one of its functions does, call that in a module of your own, and use my_module:{name}"
+    return f"{said}; use a game such as Breakout, CartPole-v1, or module:Env-v0 for an environment of a module"
 
 
 def preprocess(env: gym.Env) -> gym.Env:
-    """Turns flat observations into float32 (D,) and images into stacked grey screens, uint8 (4, 84, 84).
+    """Turns screens into stacked grey ones, uint8 (4, 84, 84), and all other observations into float32 (D,).
 
-    Raises:
-        UnsupportedSpace: the observations are neither, or the actions are not `Discrete`.
+    Raises Refused for observations with a part that is no array of numbers, and for other than `Discrete` actions.
     """
     obs_space, action_space = env.observation_space, env.action_space
     if not isinstance(action_space, Discrete):
-        raise UnsupportedSpace(f"its actions are {action_space}; only Discrete actions are supported")
-    if action_space.start != 0:  # the scripts count actions from 0
-        start = int(action_space.start)
-        env = TransformAction(env, lambda action: action + start, Discrete(action_space.n))
+        raise Refused(f"its actions are {action_space}; only Discrete actions are supported")
+    start, dtype = int(action_space.start), action_space.dtype  # the scripts count actions from 0, in int64
+    env = TransformAction(env, lambda action: dtype.type(action + start), Discrete(int(action_space.n)))
 
-    shape = obs_space.shape if isinstance(obs_space, Box) else ()
-    if len(shape) == 1 and shape[0] > 0:
-        return DtypeObservation(env, np.float32)
-    is_screen = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
-    if not (is_screen and obs_space.dtype == np.uint8):
-        raise UnsupportedSpace(
-            f"its observations are {obs_space}; only flat Box observations and uint8 images "
-            "of shape (height, width[, 1 or 3]) are supported"
-        )
+    shape = obs_space.shape if isinstance(obs_space, Box) and obs_space.dtype == np.uint8 else ()
+    is_image = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
+    if not is_image or min(shape[:2]) < SMALLEST_SCREEN:  # the small ones are grids of symbols, such as MiniGrid's
+        if refused := list(unsupported_parts(obs_space)):
+            raise Refused(f"its {' and '.join(refused)}, not numbers; register it with a wrapper that leaves this out")
+        if flatdim(obs_space) == 0:
+            raise Refused("its observations are empty")
+        return DtypeObservation(FlattenObservation(env), np.float32)
     if len(shape) == 3:
         env = GrayscaleObservation(env) if shape[-1] == 3 else ReshapeObservation(env, shape[:2])
     env = ResizeObservation(env, SCREEN)  # before the stack: one screen is resized, not four
     return FrameStackObservation(env, STACK)
+
+
+def unsupported_parts(space: Space, path: str = "observations") -> Iterator[str]:
+    """Names each part of a space that is no array of numbers: of text, Gymnasium would make character codes."""
+    if isinstance(space, Dict | Tuple):
+        for key, part in space.items() if isinstance(space, Dict) else enumerate(space):
+            yield from unsupported_parts(part, f"{path}[{key!r}]")
+    elif not isinstance(space, Box | Discrete | MultiBinary | MultiDiscrete):
+        yield f"{path} are {type(space).__name__}"

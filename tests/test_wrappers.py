@@ -1,11 +1,17 @@
 """The environments: real games step by step against a reference, names, seeds, and what is refused."""
 
+import importlib.metadata
+import sys
+
 import ale_py
 import cv2
+import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Discrete, flatdim
+from gymnasium.spaces.utils import flatten
 
+from tiny_envs import NUMBERS
 from wrappers import atari_specs, env_seeds, find_atari_game, make_envs
 
 
@@ -86,7 +92,7 @@ def test_games_match_a_frame_by_frame_reference(rom, num_steps, expect):
         obs, rewards, terminations, truncations, infos = envs.step(actions)
         for i, game in enumerate(games):
             game.step(actions[i])
-            assert rewards[i] == np.sign(game.reward)
+            assert rewards[i] == np.sign(game.reward) and rewards.dtype == np.float32
             assert terminations[i] == (game.over or game.life_lost)
             assert truncations[i] == game.truncated
             assert infos.get("_episode", np.zeros(num_envs, bool))[i] == (game.over or game.truncated)
@@ -174,9 +180,16 @@ def test_every_registered_game_is_found_by_its_bare_name():
         ("BreakoutDeterministic-v4", "use Breakout, or ALE/Breakout-v5"),
         ("BreakoutNoFrameskip-v0", "use Breakout, or ALE/Breakout-v5"),
         ("Pendulum-v1", "only Discrete actions"),
-        ("FrozenLake-v1", "only flat Box observations and uint8 images"),
-        ("Blackjack-v1", "only flat Box observations and uint8 images"),
-        ("no_such_module:Env-v0", "No module named 'no_such_module'"),
+        ("tiny_envs:ShowsMission-v0", r"its observations\['mission'\] are Text, not numbers"),
+        ("tiny_envs:ShowsDeep-v0", r"its observations\[1\]\['links'\] are Graph and .*\[1\]\['turns'\] are Sequence"),
+        ("tiny_envs:ShowsEither-v0", "its observations are OneOf, not numbers"),
+        ("tiny_envs:ShowsEmpty-v0", "its observations are empty"),
+        ("no_such_module:Env-v0", "no_such_module cannot be imported: .*; install its package, or start in the dir"),
+        ("tiny_envs:TinyPixel-v0", "tiny_envs was imported.* no TinyPixel-v0; did you mean tiny_envs:TinyPixels-v0"),
+        ("json:Xyz-v0", "json was imported.* no Xyz-v0; if one of its functions does, call that in a module of your"),
+        ("Taxi-v3", "use `Taxi-v4`"),
+        ("gymnasium:Taxi-v3", "use `gymnasium:Taxi-v4`"),
+        ("NoNamespace/Env-v0", "unknown environment; use a game such as Breakout, CartPole-v1, or module:Env-v0"),
         ("a:b:c", "unknown environment"),
         ("", "unknown environment"),
     ],
@@ -197,6 +210,65 @@ def test_other_images_become_stacked_grey_screens(env_id):
     assert np.allclose(brightest * 16 / 84, columns, atol=1)
     moved, *_ = envs.step(np.ones(3, int))
     assert np.array_equal(moved[:, :3], obs[:, 1:])  # the oldest screen leaves, the others move up
+
+
+@pytest.mark.parametrize("num_envs", [0, -1, 1.5])
+@pytest.mark.parametrize("env_id", ["Pong", "CartPole-v1"])
+def test_there_is_a_whole_number_of_environments(env_id, num_envs):
+    with pytest.raises(ValueError, match=f"num_envs is {num_envs}"):
+        make_envs(env_id, num_envs)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_all_numbers_but_screens_become_one_float32_vector(name, monkeypatch):
+    """Gymnasium's own function says which."""
+    space, shown = NUMBERS[name], []
+    sample = type(space).sample
+    monkeypatch.setattr(type(space), "sample", lambda self: shown.append(sample(self)) or shown[-1])
+    envs = make_envs(f"tiny_envs:Shows{name}-v0", 1)
+    shown.clear()
+    obs, _ = envs.reset()
+    assert envs.single_observation_space.shape == (flatdim(space),)
+    assert obs.dtype == np.float32 and np.array_equal(obs[0], flatten(space, shown[-1]).astype(np.float32))
+
+
+def test_a_cell_is_one_hot():
+    envs = make_envs("FrozenLake-v1", 1)
+    obs, _ = envs.reset(seed=[1])
+    for action in (2, 1, 2):
+        assert obs.tolist() == [[float(cell == envs.unwrapped.envs[0].unwrapped.s) for cell in range(16)]]
+        obs, *_ = envs.step(np.array([action]))
+
+
+def test_actions_have_the_type_that_the_environment_asks_for():
+    envs = make_envs("tiny_envs:ShowsCell-v0", 1)  # it checks
+    envs.reset()
+    assert envs.step(np.array([1]))[1] == [1.0]
+
+
+def test_a_module_may_lie_in_the_current_directory(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lies_here.py").write_text(
+        'import gymnasium as gym\ngym.register("LiesHere-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv")\n'
+    )
+    assert make_envs("lies_here:LiesHere-v0", 1).single_observation_space.shape == (4,)
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    with pytest.raises(ValueError, match="broken cannot be imported: ZeroDivisionError"):
+        make_envs("broken:Env-v0", 1)
+
+
+@pytest.mark.parametrize("env_id", ["Plugged/Env-v0", "tiny_envs:PluggedAsWell-v0"])
+def test_a_package_registers_in_the_call_that_it_declares(env_id, monkeypatch):
+    """MinAtar's does. It is known by the id's namespace or by its module."""
+    called = importlib.metadata.EntryPoint("Plugged", "tiny_envs:register_plugged", "gymnasium.envs")
+    others = importlib.metadata.EntryPoint("Other", "no_such_module:register", "gymnasium.envs")
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [others, called])
+    try:
+        assert make_envs(env_id, 1).single_observation_space.shape == (1,)
+    finally:
+        for registered in ("Plugged/Env-v0", "PluggedAsWell-v0"):
+            gym.registry.pop(registered, None)
 
 
 def test_flat_observations_become_float32_and_rewards_stay():

@@ -11,8 +11,10 @@ PPO then trains on.
 
 import contextlib
 import difflib
+import importlib.metadata
 import os
 import re
+import sys
 import warnings
 from collections.abc import Iterator, Sequence
 
@@ -21,10 +23,11 @@ import gymnasium as gym
 import numpy as np
 from ale_py.vector_env import AtariVectorEnv
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatdim
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.wrappers import (
     DtypeObservation,
+    FlattenObservation,
     FrameStackObservation,
     GrayscaleObservation,
     ReshapeObservation,
@@ -34,10 +37,12 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 
 gym.register_envs(ale_py)
+OWN_IDS = set(gym.registry)  # Gymnasium's and ale-py's; other packages add theirs later
 
 FRAME_SKIP = 4  # emulator frames shown for each agent step
 SCREEN = (84, 84)  # height and width of an observation, pixels
 STACK = 4  # most recent screens in an observation
+SMALLEST_SCREEN = 36  # height and width from which on uint8 observations are screens: the least that the CNN takes
 
 
 # ------------------------------------------------------------------------------------------------- environments
@@ -49,7 +54,7 @@ def make_envs(
     Args:
         env_id: an Atari game (`Breakout`, `breakout`, `BreakoutNoFrameskip-v4`: the thesis's protocol, without sticky
             actions; `ALE/Breakout-v5`: the same with its registered sticky actions), or any other registered
-            Gymnasium id, `module:Env-v0` included.
+            Gymnasium id, `module:Env-v0` included: the module may lie in the current directory.
         num_envs: the number of copies N.
         num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
         max_frames: emulator frames after which an Atari game is truncated, counted from the end of its no-ops.
@@ -57,14 +62,17 @@ def make_envs(
 
     Returns:
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
-        float32 (N, D) for flat ones. Rewards: sign-clipped for Atari, as they are elsewhere.
+        float32 (N, D) for all others. Rewards: float32 signs for Atari, as they are elsewhere.
         After a step in which games have ended, and no other, `info["_episode"]` (N,) is true for those and
-        `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; where one was
+        `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; if one was
         truncated, `info["final_obs"]` holds the observation that it ended on (other rows are not to be read).
 
     Raises:
-        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
+        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported, or
+            `num_envs` is not a whole number above 0.
     """
+    if not isinstance(num_envs, int) or num_envs < 1:  # ale-py kills the process on 0
+        raise ValueError(f"num_envs is {num_envs!r}; give a whole number above 0")
     if (atari := find_atari_game(env_id)) is None:
         return make_gymnasium_envs(env_id, num_envs, video)
     rom, repeat_action_probability = atari
@@ -83,20 +91,20 @@ def make_envs(
         "use_fire_reset": False,  # would press FIRE before the no-ops, and never after a lost life
     }
     envs = AtariVectorEnv(rom, num_envs, img_height=SCREEN[0], img_width=SCREEN[1], stack_num=STACK, **options)
-    if video is not None:  # at the bottom, where the actions are those that the games get
+    if video is not None:  # at the bottom, to see the actions that the games get
         in_colour = {"grayscale": False, "img_height": 210, "img_width": 160, "stack_num": 1}
         twin = AtariVectorEnv(rom, num_envs, **in_colour, **options)  # same seeds, same actions: the same games
         envs = RecordVideo(envs, video, 60 / FRAME_SKIP, twin)
     envs = RecordEpisodeStatistics(envs)  # above EpisodicLife it would count lives, above the sign clipped rewards
     envs = EpisodicLife(envs)
-    return TransformReward(envs, np.sign)
+    return TransformReward(envs, lambda rewards: np.sign(rewards).astype(np.float32))
 
 
 def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int]:
     """Returns a seed for each environment, drawn from one `SeedSequence`: runs with neighbouring seeds share none.
 
-    A run that has been started `starts` times before gets the next numbers of its sequence, for new games; what is
-    played beside the training has sequences of its own, `[seed, 1]` for evaluations and `[seed, 2]` for videos.
+    A run that has been started `starts` times before gets the next numbers of its sequence, for new games; games
+    played beside the training have sequences of their own, `[seed, 1]` for evaluations and `[seed, 2]` for videos.
     Gymnasium's own rule, seed, seed + 1, …, gives run 2 seven of the eight environments of run 1. 31 bits, because
     ale-py refuses larger ones.
     """
@@ -104,10 +112,42 @@ def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int
     return [int(number) for number in numbers[-num_envs:]]
 
 
+class WithoutInfo(gym.Wrapper):
+    """Drops an environment's own infos: keys such as `episode` or `final_obs` would be taken for the wrappers' here."""
+
+    def reset(self, **given):
+        return self.env.reset(**given)[0], {}
+
+    def step(self, action):
+        return (*self.env.step(action)[:4], {})
+
+
+class FiniteObservations(VectorWrapper):
+    """Raises FloatingPointError at an observation that is not finite, which no network can take."""
+
+    def reset(self, **given):
+        obs, infos = self.env.reset(**given)
+        self.num_steps = 0
+        return self.checked(obs), infos
+
+    def step(self, actions: np.ndarray):
+        obs, *rest = self.env.step(actions)
+        self.num_steps += 1
+        return (self.checked(obs), *rest)
+
+    def checked(self, obs: np.ndarray) -> np.ndarray:
+        if not (finite := np.isfinite(obs).all(axis=1)).all():
+            number = np.flatnonzero(~finite)[0]
+            raise FloatingPointError(
+                f"the observation of environment {number} is not finite after {self.num_steps} steps"
+            )
+        return obs
+
+
 class RecordVideo(VectorWrapper):
     """Writes the first game of the first environment to a WebM file (VP9): in colour, without sound, in real time.
 
-    Shows the screens of `twin`, games in lockstep with the agent's, or what the environments render. The last screen
+    Shows the screens of `twin`, games in lockstep with the agent's, or the environments' own renders. The last screen
     of a game is there only with a twin: others have already been reset when they can be asked.
     """
 
@@ -116,7 +156,7 @@ class RecordVideo(VectorWrapper):
         self.path, self.fps, self.twin, self.video = path, fps, twin, None
 
     def reset(self, *, seed=None, options=None):
-        """Begins the file anew. Raises OSError where it cannot be written."""
+        """Begins the file anew. Raises OSError if it cannot be written."""
         obs, infos = self.env.reset(seed=seed, options=options)
         screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed)[0][0, 0]
         import cv2  # here, because it changes the environment variables of whoever imports it
@@ -148,7 +188,7 @@ class RecordVideo(VectorWrapper):
             self.video.write(np.ascontiguousarray(screen[..., ::-1]))  # OpenCV takes blue first
 
     def finish(self) -> None:
-        """Ends the file. Raises OSError where it is not whole, which OpenCV does not say: the disk may be full."""
+        """Ends the file. Raises OSError if it is not whole, which OpenCV does not say: the disk may be full."""
         if self.video is None:
             return
         self.video.release()
@@ -169,8 +209,12 @@ class RecordVideo(VectorWrapper):
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Keeps what C code prints in its body from standard error."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    """Keeps the prints of C code in its body from standard error."""
+    try:
+        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:  # it is closed, and silent anyway
+        yield
+        return
     try:
         os.dup2(nowhere, 2)
         yield
@@ -181,11 +225,11 @@ def silent() -> Iterator[None]:
 
 
 class EpisodicLife(VectorWrapper):
-    """Reports a lost life as a termination while the game goes on, and presses FIRE where a life starts.
+    """Reports a lost life as a termination while the game goes on, and presses FIRE when a life starts.
 
-    A lost life is the fall of `info["lives"]` to a number above 0: the last one ends the game itself, and Frogger
-    shows 0 lives for many frames before it does. Games without lives (Pong, DoubleDunk) always show 0. No reset
-    follows, so the next observation is the next one of the same game.
+    A lost life is the fall of `info["lives"]` to a number above 0, as CleanRL and Stable-Baselines3 count it: the last
+    one ends the game itself. Frogger and BankHeist show 0 during the last life, so its start is not reported. Games
+    without lives (Pong, DoubleDunk) always show 0. No reset follows, so the next observation is the same game's.
 
     FIRE replaces the first action of each game and each life, in games that have FIRE: Breakout would stand still
     until the time limit without it. For the learner, that is an environment whose first action has no effect.
@@ -195,12 +239,15 @@ class EpisodicLife(VectorWrapper):
         super().__init__(envs)
         action_set = envs.unwrapped.ale.get_action_set()
         self.fire = action_set.index(ale_py.Action.FIRE) if ale_py.Action.FIRE in action_set else None
+        self.life_starts = np.zeros(self.num_envs, dtype=bool)
 
     def reset(self, *, seed: Sequence[int] | int | None = None, options: dict | None = None):
+        """Resets all games, or those that a mask names, `options={"reset_mask": …}` (N,)."""
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         # ale-py takes an int or an array, Gymnasium's SyncVectorEnv an int or a list
         obs, infos = self.env.reset(seed=np.array(seed) if isinstance(seed, Sequence) else seed, options=options)
         self.lives = infos["lives"]
-        self.life_starts = np.ones(self.num_envs, dtype=bool)
+        self.life_starts |= mask
         return obs, infos
 
     def step(self, actions: np.ndarray):
@@ -216,7 +263,7 @@ class EpisodicLife(VectorWrapper):
 
 
 def find_atari_game(env_id: str) -> tuple[str, float] | None:
-    """Returns the ROM's name and the probability of sticky actions, or None where `env_id` is not an Atari name.
+    """Returns the ROM's name and the probability of sticky actions, or None if `env_id` is not an Atari name.
 
     Raises:
         ValueError: an Atari name that cannot be played under the protocol of `make_envs`.
@@ -263,13 +310,16 @@ def atari_specs() -> dict[str, EnvSpec]:
 
 def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) -> VectorEnv:
     """Builds `make_envs`'s vector environment for an id that is not Atari. Raises ValueError as `make_envs` does."""
+    parts = re.fullmatch(r"((?:\w+(?:\.\w+)*:)?)([\w/.-]+)", env_id)
+    if parts is None:
+        raise ValueError(suggest("", env_id))
+    prefix, name = parts.groups()  # "module:" or nothing, and the id
     try:
-        if not re.fullmatch(r"(\w+(\.\w+)*:)?[\w/.-]+", env_id):
-            raise gym.error.UnregisteredEnv
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "out of date": the id was chosen, or is refused below in one line
+            import_registrations(prefix[:-1], name)
             envs = gym.make_vec(
-                env_id,
+                name,
                 num_envs,
                 vectorization_mode="sync",
                 vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
@@ -277,52 +327,94 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
                 **({} if video is None else {"render_mode": "rgb_array"}),
             )
             envs.reset()  # an environment that cannot start is refused here, too
-            if video is not None and envs.render()[0] is None:
-                raise ValueError("no video can be made of it, it does not render to rgb_array")
+            if video is not None and np.shape(screen := envs.render()[0])[2:] != (3,):
+                shown = "nothing" if screen is None else f"arrays of shape {np.shape(screen)}"
+                raise ValueError(f"no video can be made of it, it renders {shown}, not (height, width, 3)")
     except gym.error.UnregisteredEnv as error:
-        names = [spec.name for spec in atari_specs().values()]
-        names += [spec.id for spec in gym.registry.values() if spec.namespace is None and not is_atari(spec)]
-        by_lower = {name.lower(): name for name in names}
-        close = [by_lower[name] for name in difflib.get_close_matches(env_id.lower(), by_lower, n=3)]
-        hint = f"did you mean {' or '.join(close)}?" if close else "use a game such as Breakout, or CartPole-v1"
-        raise ValueError(f"unknown environment; {hint}") from error
-    except UnsupportedSpace:
+        raise ValueError(suggest(prefix, name)) from error
+    except Refused:
         raise
     except Exception as error:  # whatever a foreign constructor raises
         verb = "built" if video is None else "rendered"
-        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}") from error
+        reason = str(error).replace("use `", f"use `{prefix}") or type(error).__name__  # Gymnasium, of another version
+        raise ValueError(f"it cannot be {verb}: {reason}") from error
     if video is not None:
-        envs = RecordVideo(envs, video, envs.metadata.get("render_fps", 30))
+        envs = RecordVideo(envs, video, envs.metadata.get("render_fps") or 30)
+    if len(envs.single_observation_space.shape) == 1:
+        envs = FiniteObservations(envs)
     return RecordEpisodeStatistics(envs)
 
 
-class UnsupportedSpace(ValueError):
-    """Observations or actions that the scripts have no network for."""
+class Refused(ValueError):
+    """A module that cannot be imported, or observations or actions that the scripts have no network for."""
+
+
+def import_registrations(module: str, name: str) -> None:
+    """Imports an id's module, if it has one, and makes the calls that packages declare for registering environments.
+
+    They are entry points `gymnasium.envs`, named after a namespace: Gymnasium made these calls itself before 1.0.
+    """
+    if module:
+        if os.getcwd() not in sys.path:
+            sys.path.append(os.getcwd())  # last, so that nothing in it hides a package
+        try:
+            importlib.import_module(module)
+        except Exception as error:  # whatever a foreign module raises
+            advice = "install its package, or start in the directory that it lies in"
+            raise Refused(f"module {module} cannot be imported: {type(error).__name__}: {error}; {advice}") from error
+    if name not in gym.registry:
+        package, namespace = module.split(".")[0], name.rpartition("/")[0]
+        for entry_point in importlib.metadata.entry_points(group="gymnasium.envs"):
+            if entry_point.module.split(".")[0] == package or entry_point.name == namespace:
+                entry_point.load()()
+
+
+def suggest(prefix: str, name: str) -> str:
+    """Says that an id, of a module or none, is unknown, and what to write instead."""
+    names = [] if prefix else [spec.name for spec in atari_specs().values()]
+    for known, spec in gym.registry.items():
+        if known not in OWN_IDS or not (prefix or spec.namespace or is_atari(spec)):
+            names.append(known)
+    by_lower = {known.lower(): known for known in names}
+    close = [prefix + by_lower[known] for known in difflib.get_close_matches(name.lower(), by_lower, n=3)]
+    said = f"module {prefix[:-1]} was imported, but registers no {name}" if prefix else "unknown environment"
+    if close:
+        return f"{said}; did you mean {' or '.join(close)}?"
+    if prefix:
+        return f"{said}; if one of its functions does, call that in a module of your own, and use my_module:{name}"
+    return f"{said}; use a game such as Breakout, CartPole-v1, or module:Env-v0 for an environment of a module"
 
 
 def preprocess(env: gym.Env) -> gym.Env:
-    """Turns flat observations into float32 (D,) and images into stacked grey screens, uint8 (4, 84, 84).
+    """Turns screens into stacked grey ones, uint8 (4, 84, 84), and all other observations into float32 (D,).
 
-    Raises:
-        UnsupportedSpace: the observations are neither, or the actions are not `Discrete`.
+    Raises Refused for observations with a part that is no array of numbers, and for other than `Discrete` actions.
     """
     obs_space, action_space = env.observation_space, env.action_space
     if not isinstance(action_space, Discrete):
-        raise UnsupportedSpace(f"its actions are {action_space}; only Discrete actions are supported")
-    if action_space.start != 0:  # the scripts count actions from 0
-        start = int(action_space.start)
-        env = TransformAction(env, lambda action: action + start, Discrete(action_space.n))
+        raise Refused(f"its actions are {action_space}; only Discrete actions are supported")
+    env = WithoutInfo(env)
+    start, dtype = int(action_space.start), action_space.dtype  # the scripts count actions from 0, in int64
+    env = TransformAction(env, lambda action: dtype.type(action + start), Discrete(int(action_space.n)))
 
-    shape = obs_space.shape if isinstance(obs_space, Box) else ()
-    if len(shape) == 1 and shape[0] > 0:
-        return DtypeObservation(env, np.float32)
-    is_screen = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
-    if not (is_screen and obs_space.dtype == np.uint8):
-        raise UnsupportedSpace(
-            f"its observations are {obs_space}; only flat Box observations and uint8 images "
-            "of shape (height, width[, 1 or 3]) are supported"
-        )
+    shape = obs_space.shape if isinstance(obs_space, Box) and obs_space.dtype == np.uint8 else ()
+    is_image = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
+    if not is_image or min(shape[:2]) < SMALLEST_SCREEN:  # the small ones are grids of symbols, such as MiniGrid's
+        if refused := list(unsupported_parts(obs_space)):
+            raise Refused(f"its {' and '.join(refused)}, not numbers; register it with a wrapper that leaves this out")
+        if flatdim(obs_space) == 0:
+            raise Refused("its observations are empty")
+        return DtypeObservation(FlattenObservation(env), np.float32)
     if len(shape) == 3:
         env = GrayscaleObservation(env) if shape[-1] == 3 else ReshapeObservation(env, shape[:2])
     env = ResizeObservation(env, SCREEN)  # before the stack: one screen is resized, not four
     return FrameStackObservation(env, STACK)
+
+
+def unsupported_parts(space: Space, path: str = "observations") -> Iterator[str]:
+    """Names each part of a space that is no array of numbers: of text, Gymnasium would make character codes."""
+    if isinstance(space, Dict | Tuple):
+        for key, part in space.items() if isinstance(space, Dict) else enumerate(space):
+            yield from unsupported_parts(part, f"{path}[{key!r}]")
+    elif not isinstance(space, Box | Discrete | MultiBinary | MultiDiscrete):
+        yield f"{path} are {type(space).__name__}"

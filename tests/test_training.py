@@ -62,6 +62,13 @@ def test_cartpole_is_learnt(script, tmp_path):
     assert values(logged, "charts/mean_return_100")[-1] > 150
 
 
+@pytest.mark.parametrize("env_id", ["FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1", "Acrobot-v1"])
+def test_environments_with_all_kinds_of_numbers_move_the_policy(script, env_id, tmp_path):
+    logged = train(script, tmp_path, env_id=env_id, num_envs=2, num_steps=16, total_timesteps=64)
+    kl = values(logged, "losses/kl")
+    assert len(kl) == 2 and (kl > 0).all()
+
+
 def test_the_learning_rate_falls_linearly_and_steps_count_all_environments(script, tmp_path):
     logged = train(script, tmp_path, learning_rate=0.01, **{**CARTPOLE, "total_timesteps": 640})
     steps, rates = zip(*logged["charts/learning_rate"])

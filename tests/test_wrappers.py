@@ -1,11 +1,18 @@
 """The environments: real games step by step against a reference, names, seeds, and what is refused."""
 
+import importlib.metadata
+import math
+import sys
+
 import ale_py
 import cv2
+import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete
+from gymnasium.spaces import Box, Discrete, flatdim
+from gymnasium.spaces.utils import flatten
 
+from tiny_envs import NUMBERS
 from wrappers import atari_specs, env_seeds, find_atari_game, make_envs
 
 
@@ -86,7 +93,7 @@ def test_games_match_a_frame_by_frame_reference(rom, num_steps, expect):
         obs, rewards, terminations, truncations, infos = envs.step(actions)
         for i, game in enumerate(games):
             game.step(actions[i])
-            assert rewards[i] == np.sign(game.reward)
+            assert rewards[i] == np.sign(game.reward) and rewards.dtype == np.float32
             assert terminations[i] == (game.over or game.life_lost)
             assert truncations[i] == game.truncated
             assert infos.get("_episode", np.zeros(num_envs, bool))[i] == (game.over or game.truncated)
@@ -174,9 +181,16 @@ def test_every_registered_game_is_found_by_its_bare_name():
         ("BreakoutDeterministic-v4", "use Breakout, or ALE/Breakout-v5"),
         ("BreakoutNoFrameskip-v0", "use Breakout, or ALE/Breakout-v5"),
         ("Pendulum-v1", "only Discrete actions"),
-        ("FrozenLake-v1", "only flat Box observations and uint8 images"),
-        ("Blackjack-v1", "only flat Box observations and uint8 images"),
-        ("no_such_module:Env-v0", "No module named 'no_such_module'"),
+        ("tiny_envs:ShowsMission-v0", r"its observations\['mission'\] are Text, not numbers"),
+        ("tiny_envs:ShowsDeep-v0", r"its observations\[1\]\['links'\] are Graph and .*\[1\]\['turns'\] are Sequence"),
+        ("tiny_envs:ShowsEither-v0", "its observations are OneOf, not numbers"),
+        ("tiny_envs:ShowsEmpty-v0", "its observations are empty"),
+        ("no_such_module:Env-v0", "no_such_module cannot be imported: .*; install its package, or start in the dir"),
+        ("tiny_envs:TinyPixel-v0", "tiny_envs was imported.* no TinyPixel-v0; did you mean tiny_envs:TinyPixels-v0"),
+        ("json:Xyz-v0", "json was imported.* no Xyz-v0; if one of its functions does, call that in a module of your"),
+        ("Taxi-v3", "use `Taxi-v4`"),
+        ("gymnasium:Taxi-v3", "use `gymnasium:Taxi-v4`"),
+        ("NoNamespace/Env-v0", "unknown environment; use a game such as Breakout, CartPole-v1, or module:Env-v0"),
         ("a:b:c", "unknown environment"),
         ("", "unknown environment"),
     ],
@@ -197,6 +211,65 @@ def test_other_images_become_stacked_grey_screens(env_id):
     assert np.allclose(brightest * 16 / 84, columns, atol=1)
     moved, *_ = envs.step(np.ones(3, int))
     assert np.array_equal(moved[:, :3], obs[:, 1:])  # the oldest screen leaves, the others move up
+
+
+@pytest.mark.parametrize("num_envs", [0, -1, 1.5])
+@pytest.mark.parametrize("env_id", ["Pong", "CartPole-v1"])
+def test_there_is_a_whole_number_of_environments(env_id, num_envs):
+    with pytest.raises(ValueError, match=f"num_envs is {num_envs}"):
+        make_envs(env_id, num_envs)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_all_numbers_but_screens_become_one_float32_vector(name, monkeypatch):
+    """Gymnasium's own function says which."""
+    space, shown = NUMBERS[name], []
+    sample = type(space).sample
+    monkeypatch.setattr(type(space), "sample", lambda self: shown.append(sample(self)) or shown[-1])
+    envs = make_envs(f"tiny_envs:Shows{name}-v0", 1)
+    shown.clear()
+    obs, _ = envs.reset()
+    assert envs.single_observation_space.shape == (flatdim(space),)
+    assert obs.dtype == np.float32 and np.array_equal(obs[0], flatten(space, shown[-1]).astype(np.float32))
+
+
+def test_a_cell_is_one_hot():
+    envs = make_envs("FrozenLake-v1", 1)
+    obs, _ = envs.reset(seed=[1])
+    for action in (2, 1, 2):
+        assert obs.tolist() == [[float(cell == envs.unwrapped.envs[0].unwrapped.s) for cell in range(16)]]
+        obs, *_ = envs.step(np.array([action]))
+
+
+def test_actions_have_the_type_that_the_environment_asks_for():
+    envs = make_envs("tiny_envs:ShowsCell-v0", 1)  # it checks
+    envs.reset()
+    assert envs.step(np.array([1]))[1] == [1.0]
+
+
+def test_a_module_may_lie_in_the_current_directory(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "lies_here.py").write_text(
+        'import gymnasium as gym\ngym.register("LiesHere-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv")\n'
+    )
+    assert make_envs("lies_here:LiesHere-v0", 1).single_observation_space.shape == (4,)
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    with pytest.raises(ValueError, match="broken cannot be imported: ZeroDivisionError"):
+        make_envs("broken:Env-v0", 1)
+
+
+@pytest.mark.parametrize("env_id", ["Plugged/Env-v0", "tiny_envs:PluggedAsWell-v0"])
+def test_a_package_registers_in_the_call_that_it_declares(env_id, monkeypatch):
+    """MinAtar's does. It is known by the id's namespace or by its module."""
+    called = importlib.metadata.EntryPoint("Plugged", "tiny_envs:register_plugged", "gymnasium.envs")
+    others = importlib.metadata.EntryPoint("Other", "no_such_module:register", "gymnasium.envs")
+    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [others, called])
+    try:
+        assert make_envs(env_id, 1).single_observation_space.shape == (1,)
+    finally:
+        for registered in ("Plugged/Env-v0", "PluggedAsWell-v0"):
+            gym.registry.pop(registered, None)
 
 
 def test_flat_observations_become_float32_and_rewards_stay():
@@ -240,3 +313,72 @@ def test_runs_with_neighbouring_seeds_share_no_environment_seed():
     assert len(set(seeds)) == len(seeds)
     assert all(type(number) is int and 0 <= number < 2**31 for number in seeds)
     assert env_seeds(1, 8) == env_seeds(1, 8)
+
+
+class OwnInfos(gym.Env):
+    """Has infos of its own under names that the wrappers use; a game is ten steps of reward 1."""
+
+    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": None}
+    infos = {"episode": {"r": 0.0, "l": 0}, "_episode": 3, "final_obs": "none", "lives": 2}
+
+    def __init__(self, render_mode: str | None = None, observation=0.0, screen=None):
+        self.render_mode, self.observation, self.screen = render_mode, observation, screen
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1, np.float32), self.infos
+
+    def step(self, action):
+        self.steps += 1
+        observation = np.array([self.observation if self.steps == 7 else 0.0])
+        return observation, 1.0, self.steps == 10, False, self.infos
+
+    def render(self):
+        return self.screen
+
+
+@pytest.fixture
+def own_infos():
+    gym.register("OwnInfos-v0", OwnInfos)
+    yield lambda **given: gym.registry["OwnInfos-v0"].kwargs.update(given)
+    del gym.registry["OwnInfos-v0"]
+
+
+def test_only_the_scores_that_the_wrappers_measure_count(own_infos):
+    envs = make_envs("OwnInfos-v0", 2)
+    envs.reset(seed=[1, 2])
+    infos = [envs.step(np.array([0, 1]))[-1] for _ in range(10)]
+    assert all("episode" not in info for info in infos[:-1])
+    assert infos[-1]["episode"]["r"].tolist() == [10, 10] and infos[-1]["_episode"].all()
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("observation", [math.nan, math.inf, 1e300])  # the last is finite in float64 alone
+def test_an_observation_that_is_not_finite_is_told_by_environment_and_step(own_infos, observation):
+    own_infos(observation=observation)
+    envs = make_envs("OwnInfos-v0", 2)
+    envs.reset(seed=[1, 2])
+    with pytest.raises(FloatingPointError, match="environment 0 is not finite after 7 steps"):
+        for _ in range(7):
+            envs.step(np.array([0, 1]))
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (8, 8, 4)])
+def test_pictures_that_no_video_can_show_are_refused(own_infos, shape, tmp_path):
+    own_infos(screen=np.zeros(shape, np.uint8))
+    with pytest.raises(ValueError, match="not \\(height, width, 3\\)"):
+        make_envs("OwnInfos-v0", 1, video=str(tmp_path / "none.webm"))
+    own_infos(screen=np.zeros((8, 8, 3), np.uint8))
+    assert make_envs("OwnInfos-v0", 1, video=str(tmp_path / "none.webm")).env.env.fps == 30  # metadata says None
+
+
+def test_a_reset_of_some_games_presses_fire_in_those_alone():
+    envs = make_envs("Breakout", 2)
+    envs.reset(seed=env_seeds(1, 2))
+    for _ in range(3):
+        envs.step(np.zeros(2, int))
+    assert envs.env.life_starts.tolist() == [False, False]
+    envs.reset(options={"reset_mask": np.array([False, True])})
+    assert envs.env.life_starts.tolist() == [False, True]

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box, Discrete
+from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiBinary, MultiDiscrete, OneOf, Sequence, Text, Tuple
 
 
 class TinyPixels(gym.Env):
@@ -17,7 +17,7 @@ class TinyPixels(gym.Env):
     action_space = Discrete(2)
 
     def __init__(self, channels: int | None = 3):
-        shape = (12, 16) if channels is None else (12, 16, channels)
+        shape = (36, 48) if channels is None else (36, 48, channels)
         self.observation_space = Box(0, 255, shape, np.uint8)
 
     def reset(self, *, seed=None, options=None):
@@ -32,7 +32,7 @@ class TinyPixels(gym.Env):
 
     def screen(self):
         screen = np.zeros(self.observation_space.shape, np.uint8)
-        screen[:, self.column] = 255
+        screen[:, 3 * self.column : 3 * self.column + 3] = 255
         return screen
 
 
@@ -103,6 +103,43 @@ class CountsFromFive(gym.Env):
         return np.zeros(1, np.float32), float(action), False, False, {}
 
 
+class Shows(gym.Env):
+    """Observes samples of a space, and pays 1 for an action of its own space, int8; anything else is an error."""
+
+    action_space = Discrete(2, dtype=np.int8)
+
+    def __init__(self, space: gym.Space):
+        self.observation_space = space
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observation_space.sample(), {}
+
+    def step(self, action):
+        assert action in self.action_space
+        return self.observation_space.sample(), 1.0, False, False, {}
+
+
+NUMBERS = {
+    "Cell": Discrete(3, start=5),
+    "Number": Box(0, 1, ()),
+    "Switches": MultiBinary((2, 3)),
+    "Counts": MultiDiscrete([2, 3]),
+    "Booleans": Box(0, 1, (4, 4, 2), bool),
+    "Grid": Box(0, 10, (7, 7, 3), np.uint8),
+    "Wide": Box(0, 255, (35, 84), np.uint8),
+    "Narrow": Box(0, 255, (84, 35, 3), np.uint8),
+    "FourChannels": Box(0, 255, (84, 84, 4), np.uint8),
+    "Nested": Dict(place=Tuple([Discrete(4), Box(-1, 1, (2, 2), np.float64)]), image=Box(0, 255, (40, 40), np.uint8)),
+}
+NO_NUMBERS = {
+    "Mission": Dict(image=Box(0, 10, (7, 7, 3), np.uint8), mission=Text(9)),
+    "Deep": Tuple([Discrete(2), Dict(links=Graph(Box(0, 1, (1,)), None), turns=Sequence(Discrete(2)))]),
+    "Either": OneOf([Discrete(2), Box(0, 1, (2,))]),
+    "Empty": Box(0, 1, (0,)),
+}
+
+
 class CannotStart(gym.Env):
     """Fails when it is built, or when it is reset."""
 
@@ -116,6 +153,11 @@ class CannotStart(gym.Env):
         raise FileNotFoundError("level.txt")
 
 
+def register_plugged() -> None:
+    gym.register("Plugged/Env-v0", RewardNothing)
+    gym.register("PluggedAsWell-v0", RewardNothing)
+
+
 gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})
 gym.register("CannotBeReset-v0", CannotStart, kwargs={"fails_in": "reset"})
 gym.register("CountsFromFive-v0", CountsFromFive)
@@ -124,6 +166,8 @@ gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
 gym.register("RewardNothing-v0", RewardNothing)
 gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)
 gym.register("Stuck-v0", Stuck)
+for name, space in (NUMBERS | NO_NUMBERS).items():
+    gym.register(f"Shows{name}-v0", Shows, kwargs={"space": space})
 gym.register("TinyPixels-v0", TinyPixels, max_episode_steps=20)
 gym.register("TinyPixelsGrey-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": None})
 gym.register("TinyPixelsOneChannel-v0", TinyPixels, max_episode_steps=20, kwargs={"channels": 1})

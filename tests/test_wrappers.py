@@ -318,22 +318,24 @@ def test_runs_with_neighbouring_seeds_share_no_environment_seed():
 class OwnInfos(gym.Env):
     """Has infos of its own under names that the wrappers use; a game is ten steps of reward 1."""
 
-    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
+    observation_space, action_space = Box(-math.inf, math.inf, (1,), np.float64), Discrete(2)
     metadata = {"render_modes": ["rgb_array"], "render_fps": None}
-    infos = {"episode": {"r": 0.0, "l": 0}, "_episode": 3, "final_obs": "none", "lives": 2}
 
     def __init__(self, render_mode: str | None = None, observation=0.0, screen=None):
         self.render_mode, self.observation, self.screen = render_mode, observation, screen
 
+    def infos(self) -> dict:
+        return {"episode": {"r": 0.0, "l": 0}, "_episode": 3, "final_obs": "none", "lives": 2}
+
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
         self.steps = 0
-        return np.zeros(1, np.float32), self.infos
+        return np.zeros(1), self.infos()
 
     def step(self, action):
         self.steps += 1
         observation = np.array([self.observation if self.steps == 7 else 0.0])
-        return observation, 1.0, self.steps == 10, False, self.infos
+        return observation, 1.0, self.steps == 10, False, self.infos()
 
     def render(self):
         return self.screen

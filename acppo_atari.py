@@ -352,9 +352,7 @@ def train(
     rewards = torch.zeros((T, N), device=device)
     terminations = torch.zeros((T, N), dtype=torch.bool, device=device)
     truncations = torch.zeros((T, N), dtype=torch.bool, device=device)
-    final_values = torch.zeros(
-        (T, N), device=device
-    )  # V(final observation) of truncated episodes; other entries are not read
+    final_values = torch.zeros((T, N), device=device)  # V(final observation), read where an episode was truncated
     obs[T] = first_obs
     stopwatch, status_line = Stopwatch(), StatusLine()
 

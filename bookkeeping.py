@@ -86,6 +86,21 @@ def flag(name: str, value: object) -> str:
     return f"--{name.replace('_', '-')} {value}"
 
 
+def parse(args_class: Callable, **given):
+    """Parses the command line with tyro. `--help` that has no reader, or no letter for ε, is no failure."""
+    if sys.stdout is None:  # closed before Python started
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+    sys.stdout.reconfigure(errors="replace")
+    try:
+        try:
+            return tyro.cli(args_class, **given)
+        finally:
+            sys.stdout.flush()
+    except OSError:  # Python would flush again at its end, and fail
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit()
+
+
 def file_name(script: str) -> str:
     """Returns a name for a script's runs: that of its file, without characters unfit for a directory's name."""
     return re.sub(r"[^\w.-]", "-", os.path.basename(script).removesuffix(".py"))[:100] or "run"
@@ -112,7 +127,7 @@ def tune_process() -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping
     # them cuts these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
-    if hasattr(libc := ctypes.CDLL(None), "mallopt"):
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-1, 1 << 30)
         if not libc.mallopt(-3, 1 << 30):
             libc.mallopt(-3, 1 << 25)  # the most that an older glibc takes
@@ -152,6 +167,8 @@ def check(args) -> None:
     """Refuses the first argument that is out of its bounds or breaks one of `args.rules()`."""
     for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
+        if isinstance(value, str) and value != value.encode(errors="replace").decode():
+            refuse(flag(name, value), "give it in UTF-8")  # TensorBoard can take no other paths
         for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # `X | None` has X among its args
             for bounds in getattr(kind, "__metadata__", ()):
                 if isinstance(bounds, Bounds) and not bounds.allow(value):
@@ -586,21 +603,6 @@ def record_game_if_due(
 
 
 # --------------------------------------------------------------------------------------------------- command line
-def parse(args_class: type, **given):
-    """Parses the command line. `--help` that has no reader, or no letter for ε, is no failure."""
-    if sys.stdout is None:  # closed before Python started
-        sys.stdout = open(os.devnull, "w", encoding="utf-8")
-    sys.stdout.reconfigure(errors="replace")
-    try:
-        try:
-            return tyro.cli(args_class, **given)
-        finally:
-            sys.stdout.flush()
-    except OSError:  # Python would flush again at its end, and fail
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.exit()
-
-
 def open_run(args_class: type, description: str):
     """Chooses between training anew, resuming and evaluating, and refuses impossible calls with status 2.
 

@@ -32,10 +32,8 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
-import tyro
-
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import available_cores, refuse, say
+from bookkeeping import available_cores, parse, refuse, say, tell
 
 SCRIPTS = Path(__file__).resolve().parent.parent
 # A line each: the script and its arguments, ε and c always among them, so that a checkpoint can be held against them
@@ -362,7 +360,7 @@ class Progress:
 
 
 def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
+    args = parse(Args, description=__doc__)
     check(args)
     args.out = args.out.resolve()  # the tasks stand elsewhere
     # Seed by seed, variants innermost, so that pairs are complete early
@@ -380,7 +378,7 @@ def main() -> None:
         if args.dry_run:
             for run in runs:
                 todo = f"from step {run.step:,}: {shlex.join(run.command(args))}"
-                print(f"{run.name}: {run.reason or ('finished' if run.state == 'done' else todo)}")
+                tell(f"{run.name}: {run.reason or ('finished' if run.state == 'done' else todo)}")
             sys.exit(any(run.state == "failed" for run in runs))
         if any(run.state == "queued" for run in runs):
             run_grid(runs, args)

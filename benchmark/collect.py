@@ -17,11 +17,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import refuse, say, write_text
+from bookkeeping import parse, refuse, say, tell, write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 DEFAULT_OUT = ROOT / "benchmark" / "results"
@@ -179,12 +178,12 @@ def read_grid(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
+    args = parse(Args, description=__doc__)
     try:
         runs, curves = read_grid(args.out)
     except OSError as error:
         refuse(f"--out {args.out}", f"cannot use {error.filename} ({error.strerror})")
-    print(f"{args.out}: {len(runs)} runs, {len(curves):,} iterations")
+    tell(f"{args.out}: {len(runs)} runs, {len(curves):,} iterations")
 
 
 if __name__ == "__main__":

@@ -26,7 +26,6 @@ if __name__ == "__main__":
 
 import matplotlib
 import pandas as pd
-import tyro
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -56,7 +55,7 @@ from benchmark.claims import (
 )
 from benchmark.collect import DEFAULT_OUT, KEY, ROOT, read_grid
 from benchmark.readme import split_readme, write_part
-from bookkeeping import refuse, write_text
+from bookkeeping import parse, refuse, tell, write_text
 from wrappers import FRAME_SKIP, find_atari_game
 
 # Figure → its title and the columns it shows, each with its y axis
@@ -279,7 +278,7 @@ def results_part(stages: list[Stage]) -> str:
 
 
 def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
+    args = parse(Args, description=__doc__)
     try:
         stages = make_stages(*read_grid(args.out))
         readme = args.out / "README.md"
@@ -296,7 +295,7 @@ def main() -> None:
             write_part(readme, "results", part)
     except OSError as error:
         refuse(f"--out {args.out}", f"cannot use {error.filename} ({error.strerror})")
-    print(f"{args.out}: runs.csv, curves.csv, figures/, README.md")
+    tell(f"{args.out}: runs.csv, curves.csv, figures/, README.md")
 
 
 if __name__ == "__main__":

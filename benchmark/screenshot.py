@@ -18,7 +18,7 @@ from pathlib import Path
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import refuse
+from bookkeeping import parse, refuse
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -73,4 +73,4 @@ def main(logdir: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path]
 
 
 if __name__ == "__main__":
-    tyro.cli(main, description=__doc__)
+    parse(main, description=__doc__)

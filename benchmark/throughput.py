@@ -48,7 +48,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, measure_limits
 from benchmark.readme import markdown, write_part
-from bookkeeping import available_cores, refuse, write_text
+from bookkeeping import available_cores, parse, refuse, write_text
 from wrappers import find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -395,7 +395,7 @@ def readme_table(directory: Path = RESULTS) -> str:
 
 # ------------------------------------------------------------------------------------------------- command line
 def main() -> None:
-    args = tyro.cli(Args, description=__doc__)
+    args = parse(Args, description=__doc__)
     if args.table:
         if not write_part(ROOT / "README.md", "speed", readme_table()):
             refuse("--table", "README.md has no <!-- speed --> … <!-- end speed -->, once, to write between")

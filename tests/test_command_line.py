@@ -3,6 +3,7 @@
 import contextlib
 import json
 import math
+import os
 import re
 import shlex
 import subprocess
@@ -153,6 +154,7 @@ REFUSED = [
     (["--env-id", "Pendulum-v1"], "--env-id Pendulum-v1", "only Discrete actions"),
     (["--gamma", "1.01"], "--gamma 1.01", "from 0 to 1"),
     (["--log-dir", "taken"], "--log-dir taken", "cannot be written"),
+    (["--log-dir", "r\udcff"], "--log-dir r?", "give it in UTF-8"),  # a byte that is no UTF-8, as Python decodes it
 ]
 
 
@@ -235,3 +237,21 @@ def test_arguments_at_the_edge_of_going_together_are_taken(script):
 def test_importing_a_script_leaves_the_environment_alone():
     probe = "import os; before = dict(os.environ); import ppo_atari, acppo_atari; assert os.environ == before"
     subprocess.run([sys.executable, "-c", probe], cwd=ROOT, check=True, timeout=PATIENCE)
+
+
+def test_nothing_that_only_posix_has_is_needed_to_import_and_train(tmp_path):
+    """What another system lacks is taken away: modules, signals, and functions of `os`."""
+    probe = """
+import os, signal, sys
+sys.modules |= dict.fromkeys(("fcntl", "resource", "pwd", "grp", "termios"))
+for module, names in ((os, "sched_getaffinity getuid fchmod"), (signal, "SIGHUP")):
+    for name in names.split():
+        delattr(module, name)
+sys.argv[1:] = "--env-id CartPole-v1 --num-steps 8 --total-timesteps 64 --threads 1 --eval-episodes 0".split()
+import acppo_atari
+acppo_atari.main()
+"""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", probe]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=PATIENCE)
+    assert ended.returncode == 0, ended.stderr

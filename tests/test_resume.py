@@ -224,6 +224,12 @@ def test_a_run_is_found_by_its_checkpoint_and_named_if_its_parent_is_given(scrip
     assert call_main(script, "--resume", str(tmp_path)) == (2, "", said)
 
 
+def test_a_run_that_cannot_be_written_is_refused_unless_it_is_only_played(script, finished, monkeypatch, call_main):
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert call_main(script, "--resume", "finished") == (2, "", "--resume finished: it cannot be written\n")
+    assert call_main(script, "--evaluate", "finished", "--eval-episodes", "1").status == 0
+
+
 def test_the_same_log_dir_in_another_spelling_is_no_change(script, tmp_path, call_main):
     call_main(script, *flags_of(**CARTPOLE, total_timesteps=256, stop_at=128, log_dir="runs"))
     resumed = call_main(script, "--resume", str(run_dir_in(tmp_path / "runs")), "--log-dir", str(tmp_path / "runs"))

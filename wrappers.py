@@ -61,7 +61,7 @@ def make_envs(
         video: a WebM file that the first game of the first environment is written to, from each `reset` on.
 
     Returns:
-        A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
+        A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other screens,
         float32 (N, D) for all others. Rewards: float32 signs for Atari, as they are elsewhere.
         After a step in which games have ended, and no other, `info["_episode"]` (N,) is true for those and
         `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; where one was

@@ -16,7 +16,6 @@ Sections: arguments, network, mathematics, training, command line.
 """
 
 import math
-import os
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -104,11 +103,12 @@ class Args:
     cuda: bool = True
     """use a GPU if there is one"""
     threads: Threads = field(default_factory=bookkeeping.available_cores)
-    """threads of torch; the emulators use as many, in turn with it. The default is the cores this process may use"""
+    """threads of torch; the emulators use as many, in turn with it. The default is the cores that this process may use;
+    in a container with a CPU quota, which it does not see, give the quota"""
     bf16: bool = False
     """run the network's trunk in bfloat16 (ours): faster on processors with AVX512-BF16 or AMX, far slower on others;
     parameters, logits, values and losses stay float32"""
-    exp_name: FileName = os.path.basename(__file__).removesuffix(".py")
+    exp_name: FileName = bookkeeping.file_name(__file__)
     """name of the experiment, part of the run's name"""
     log_dir: str = "runs"
     """directory that the run's own directory is made in"""
@@ -167,6 +167,8 @@ class Agent(nn.Module):
     def __init__(self, obs_shape: tuple[int, ...], num_actions: int, bf16: bool = False):
         super().__init__()
         self.bf16 = bf16
+        if len(obs_shape) != 1 and obs_shape[1:] != (84, 84):
+            raise ValueError(f"observations of shape {obs_shape}; give (channels, 84, 84) or (size,)")
         if len(obs_shape) == 3:
             self.network = nn.Sequential(
                 orthogonal(nn.Conv2d(obs_shape[0], 32, 8, stride=4)),
@@ -260,8 +262,8 @@ def compute_gae(rewards, values, next_values, terminations, truncations, gamma: 
     """
     deltas = rewards + gamma * next_values * ~terminations - values  # δ_t
     not_done = ~(terminations | truncations)  # the sum of an episode stops at its end
-    advantages = torch.zeros_like(rewards)
-    last_advantage = torch.zeros_like(rewards[0])
+    advantages = torch.zeros_like(deltas)  # whatever the rewards' dtype
+    last_advantage = torch.zeros_like(deltas[0])
     for t in reversed(range(len(rewards))):
         advantages[t] = last_advantage = deltas[t] + gamma * gae_lambda * not_done[t] * last_advantage
     return advantages
@@ -337,7 +339,7 @@ def train(
     iterations_done = run.start(args, state, agent, optimizer)
     run.save(args, iterations_done, agent, optimizer)  # so that a new run can be resumed at once, and this start counts
     new_policy = partial(make_policy, agent, args.seed)  # a fresh generator for each film
-    bookkeeping.record_game_if_due(args, new_policy, run, iterations_done)
+    bookkeeping.record_game_if_due(args, new_policy, run, iterations_done, stop)
 
     # Storage: T steps of N environments. Row T follows them: its observations begin the next rollout.
     T, N = args.num_steps, args.num_envs
@@ -350,9 +352,7 @@ def train(
     rewards = torch.zeros((T, N), device=device)
     terminations = torch.zeros((T, N), dtype=torch.bool, device=device)
     truncations = torch.zeros((T, N), dtype=torch.bool, device=device)
-    final_values = torch.zeros(
-        (T, N), device=device
-    )  # V(final observation) of truncated episodes; other entries are not read
+    final_values = torch.zeros((T, N), device=device)  # V(final observation), read where an episode was truncated
     obs[T] = first_obs
     stopwatch, status_line = Stopwatch(), StatusLine()
 
@@ -457,9 +457,8 @@ def train(
         status_line.show(args, iteration, charts["charts/SPS"], run.last_scores)
 
         # Film and checkpoint
+        bookkeeping.record_game_if_due(args, new_policy, run, iteration, stop)
         stopping = stop.number != 0  # read once: a signal after this line is served after the next iteration
-        if not stopping:
-            bookkeeping.record_game_if_due(args, new_policy, run, iteration)
         if stopping or iteration == args.last_iteration or run.is_checkpoint_due():
             run.save(args, iteration, agent, optimizer)
         if stopping:
@@ -478,10 +477,10 @@ def main() -> None:
         else:
             agent = make_agent(args, envs)
             run.restore_agent(state, agent)
+        bookkeeping.finish(args, partial(make_policy, agent, args.seed), run, stop)
     except FloatingPointError as error:
         say(f"{run.path}: {error}")
         sys.exit(1)
-    bookkeeping.finish(args, partial(make_policy, agent, args.seed), run, stop)
 
 
 if __name__ == "__main__":

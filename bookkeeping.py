@@ -11,7 +11,7 @@ that is passed in as a function, so this file knows no network and no loss.
 import contextlib
 import csv
 import ctypes
-import fcntl
+import hashlib
 import importlib.metadata
 import inspect
 import itertools
@@ -21,6 +21,7 @@ import os
 import platform
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,11 +35,12 @@ from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Annotated, Any
 
+import filelock
 import numpy as np
 import tyro
 from gymnasium.vector import VectorEnv
 
-from wrappers import env_seeds, make_envs
+from wrappers import canonical_name, env_seeds, make_envs
 
 Policy = Callable[[np.ndarray], np.ndarray]  # observations (N, …) → actions (N,)
 OF_ONE_CALL = {"resume", "evaluate", "stop_at"}  # arguments that a run does not keep
@@ -64,11 +66,17 @@ def say(text: str, end: str = "\n") -> None:
     start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
     with contextlib.suppress(OSError):
         if sys.stderr is not None:  # None: closed before Python started, and 2 may be a file of ours
-            os.write(2, (start + text + end).encode())
+            os.write(2, (start + text + end).encode(errors="replace"))
+
+
+def tell(text: str) -> None:
+    """Writes to standard output and ignores errors: a result that nobody reads is no failure."""
+    with contextlib.suppress(OSError):
+        os.write(1, (text + "\n").encode(errors="replace"))
 
 
 def refuse(given: str, advice: object) -> typing.NoReturn:
-    """Ends the program with status 2 and one line: what was given, and what to do."""
+    """Ends the program with status 2 and one line: the refused input, and the advice."""
     say(" ".join(f"{given}: {advice}".split()))
     sys.exit(2)
 
@@ -76,6 +84,11 @@ def refuse(given: str, advice: object) -> typing.NoReturn:
 def flag(name: str, value: object) -> str:
     """Returns an argument as it is given on the command line, for `refuse`."""
     return f"--{name.replace('_', '-')} {value}"
+
+
+def file_name(script: str) -> str:
+    """Returns a name for a script's runs: that of its file, without characters unfit for a directory's name."""
+    return re.sub(r"[^\w.-]", "-", os.path.basename(script).removesuffix(".py"))[:100] or "run"
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
@@ -92,7 +105,9 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 
 def tune_process() -> None:
-    """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
+    """Sets up a process that trains, before it imports torch: how it ends, how threads wait, how memory is kept."""
+    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback out of an import; `open_run` listens later
     # Idle OpenMP threads would spin on the cores that the games' threads need
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping
@@ -151,12 +166,18 @@ class RunDirectory:
     """A run's checkpoint and event files, held by one process at a time. A full disk costs points, not the run."""
 
     def __init__(self, path: str):
-        """Opens an existing directory. Raises OSError; BlockingIOError if another process holds it."""
+        """Opens an existing directory. Raises OSError; filelock.Timeout if another process holds it.
+
+        One that cannot be written, on a read-only file system for example, is opened for evaluations, without a lock.
+        """
+        os.listdir(path)
         self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
-        self.lock = os.open(path, os.O_RDONLY)
-        fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # dies with its process, unlike a lock file
+        # On a file, because NFS does not pass locks on directories on. The lock dies with its process, the file stays.
+        self.lock = filelock.FileLock(os.path.join(path, "run.lock"))
+        if os.access(path, os.W_OK):
+            self.lock.acquire(blocking=False)
         self.writer = None
-        self.waiting = False  # True after a failure, until a checkpoint could be written: drops what is logged
+        self.waiting = False  # True after a failure, until a checkpoint could be written; points are dropped meanwhile
         self.not_written: set[str] = set()
         self.iteration = 0  # of the last checkpoint
         self.num_starts = 0  # each start of a run plays games of its own
@@ -166,7 +187,7 @@ class RunDirectory:
     @classmethod
     def make(cls, args) -> "RunDirectory":
         """Makes a new run's directory in `args.log_dir`. If its name is taken, it gets that of the next second."""
-        name = re.sub(r"[^\w.-]", "-", args.env_id)
+        name = re.sub(r"[^\w.-]", "-", canonical_name(args.env_id))
         try:
             for second in itertools.count(int(time.time())):
                 path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
@@ -182,10 +203,14 @@ class RunDirectory:
     @classmethod
     def open(cls, path: str, name: str, args_class: type) -> tuple["RunDirectory", dict]:
         """Returns the run in a directory that was given as the argument `name`, and its checkpoint; see `load`."""
+        if os.path.basename(path) == "checkpoint.pt":
+            path = os.path.dirname(path) or "."
         try:
+            if name == "resume" and not os.access(path, os.W_OK) and os.path.isdir(path):
+                raise ValueError("it cannot be written")
             run = cls(path)
             return run, run.load(args_class)
-        except BlockingIOError:
+        except filelock.Timeout:
             refuse(flag(name, path), "another process holds it; wait for its end")
         except (OSError, ValueError) as error:
             refuse(flag(name, path), getattr(error, "strerror", None) or error)
@@ -194,14 +219,18 @@ class RunDirectory:
         """Lets go of the directory, for another process or object to open it."""
         if self.writer is not None:
             self.writer.close()
-        os.close(self.lock)
+        self.lock.release()
 
     def load(self, args_class: type) -> dict:
         """Returns the checkpoint. Raises ValueError if there is none, or none of a script with these arguments."""
         import torch
 
         if not os.path.exists(self.checkpoint):
-            raise ValueError("it holds no checkpoint; start the run anew")
+            runs = [
+                name for name in sorted(os.listdir(self.path)) if os.path.exists(f"{self.path}/{name}/checkpoint.pt")
+            ]
+            advice = f"give a run in it: {' '.join(runs)}" if runs else "start the run anew"
+            raise ValueError(f"it holds no checkpoint; {advice}")
         try:
             with zipfile.ZipFile(self.checkpoint) as archive:
                 whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
@@ -255,8 +284,9 @@ class RunDirectory:
         about = {
             "command": command_line(args),
             "started_at_step": step,  # above 0 for a resumed run, which the command does not repeat
-            "args": saved_args(args),
-            "provenance": provenance(),
+            # JSON has no infinity
+            "args": {name: str(value) if value == math.inf else value for name, value in saved_args(args).items()},
+            "provenance": provenance(inspect.getfile(type(args))),
         }
         with self.reporting("args.json"):
             write_text(os.path.join(self.path, "args.json"), json.dumps(about, indent=2))
@@ -288,7 +318,7 @@ class RunDirectory:
         """
         from torch.utils.tensorboard import SummaryWriter
 
-        with self.reporting("the evaluation"):
+        with self.reporting("the evaluation", then=""):
             with SummaryWriter(self.path, filename_suffix=".eval") as writer:
                 for name, value in stats.items():
                     writer.add_scalar(f"eval/{name}", value, step)
@@ -326,7 +356,10 @@ class RunDirectory:
                     with open(name, "rb+") as file:  # on the disk before the rename is, even if the power fails
                         os.fsync(file.fileno())
                 os.replace(new, self.checkpoint)
-                os.fsync(self.lock)
+                with contextlib.suppress(OSError):  # not every file system can; nothing is lost if it works without
+                    directory = os.open(self.path, os.O_RDONLY)
+                    os.fsync(directory)
+                    os.close(directory)
                 self.iteration, self.waiting = state["iteration"], False
             except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
                 with contextlib.suppress(OSError):
@@ -347,13 +380,13 @@ class RunDirectory:
             raise
 
     @contextlib.contextmanager
-    def reporting(self, what: str) -> Iterator[None]:
-        """Says once that `what` cannot be written, and lets the run go on."""
+    def reporting(self, what: str, then: str = "; the run goes on") -> Iterator[None]:
+        """Says once that `what` cannot be written, and goes on."""
         try:
             yield
         except OSError as error:
             if what not in self.not_written:
-                say(f"{self.path}: {what} cannot be written ({error}); the run goes on")
+                say(f"{self.path}: {what} cannot be written ({error}){then}")
             self.not_written.add(what)
 
     def event_files(self) -> dict[str, int]:
@@ -364,19 +397,26 @@ class RunDirectory:
 
 # ---------------------------------------------------------------------------------------------- beside the loop
 class StopSignal:
-    """Notes the first SIGINT or SIGTERM in `number`, for a clean end; a second ends the process at once."""
+    """Notes the first SIGINT, SIGTERM or SIGHUP in `number`, for a clean end; one that comes later ends at once.
+
+    Later is a second or more: launchers send the same signal to a process and to its group, which it is in. A signal
+    that is ignored when the script starts stays ignored, as after `nohup`.
+    """
 
     number = 0
 
-    def listen(self, handler=None) -> None:
-        """Installs `handler` for both signals, by default `note`; `signal.SIG_DFL` gives them back to the system."""
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self.note if handler is None else handler)
+    def listen(self) -> None:
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            if number is not None and signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, self.note)
 
     def note(self, number: int, frame: object) -> None:
-        self.number = number
-        self.listen(signal.SIG_DFL)
-        say("Stopping after this iteration, with a checkpoint; once more ends at once")
+        if not self.number:
+            self.number, self.since = number, time.monotonic()
+            say("Stopping cleanly; another signal, at least a second from now, ends at once")
+        elif time.monotonic() - self.since >= 1:
+            os._exit(128 + number)  # not by SIG_DFL, which the kernel ignores for process 1 of a container
 
 
 class Stopwatch:
@@ -415,6 +455,7 @@ class StatusLine:
         step, last_step = iteration * args.batch_size, args.last_iteration * args.batch_size
         line = f"step {step:,} of {last_step:,}, {sps:.0f} SPS{score}, {left} left"
         if os.isatty(2):
+            line = line[: shutil.get_terminal_size().columns - 1]  # a line that wraps cannot be written over
             say(line, end="\n" if iteration == args.last_iteration else "")
         elif time.perf_counter() >= self.due:
             say(line)
@@ -432,19 +473,38 @@ def command_line(args) -> str:
     for name, value in saved_args(args).items():
         if value != defaults[name] or name in ("env_id", "seed", "threads"):
             words.append(f"--{'no-' if value is False else ''}{name.replace('_', '-')}")
-            words += [] if isinstance(value, bool) else [str(value)]
+            if str(value).startswith("-"):  # a flag of its own, otherwise
+                words[-1] += f"={value}"
+            elif not isinstance(value, bool):
+                words.append(str(value))
     return shlex.join(words)
 
 
-def provenance() -> dict[str, object]:
+def commit_of(script: str) -> str:
+    """Returns the commit of this checkout; `-dirty` if it has changes, or does not hold the script."""
+    here = os.path.dirname(os.path.abspath(__file__))
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # of another repository
+
+    def git(*words: str) -> subprocess.CompletedProcess:
+        return subprocess.run(["git", "-C", here, *words], capture_output=True, text=True, env=clean)
+
+    try:  # --exclude: the hash, not a tag
+        described = git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+        holds = git("ls-files", "--error-unmatch", os.path.abspath(script)).returncode == 0
+    except OSError as error:
+        return f"unknown ({error})"
+    if described.returncode != 0:
+        return f"unknown ({' '.join(described.stderr.split())})"
+    commit = described.stdout.strip()
+    return commit if holds or commit.endswith("-dirty") else f"{commit}-dirty"
+
+
+def provenance(script: str) -> dict[str, object]:
     """Returns the versions, commit, machine and threads, which a reader needs beside the arguments to repeat a run."""
     import torch
 
-    git = ["git", "-C", os.path.dirname(os.path.abspath(__file__)), "describe", "--always", "--dirty", "--abbrev=40"]
-    try:  # --exclude: no tags, the commit itself
-        commit = subprocess.run([*git, "--exclude=*"], capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        commit = "not a git checkout"
+    with open(script, "rb") as file:
+        text = hashlib.sha256(file.read()).hexdigest()
     versions = {}
     for package in ("torch", "gymnasium", "ale-py", "numpy", "opencv-python-headless", "tensorboard", "tyro"):
         try:
@@ -453,68 +513,94 @@ def provenance() -> dict[str, object]:
             versions[package] = "unknown"
     machine = f"{platform.platform()}, {available_cores()} cores, {torch.backends.cpu.get_cpu_capability()}"
     threads = f"{torch.get_num_threads()} torch, OMP_WAIT_POLICY {os.environ.get('OMP_WAIT_POLICY', 'not set')}"
-    return {"commit": commit, "python": platform.python_version(), **versions, "machine": machine, "threads": threads}
+    versions = {"python": platform.python_version(), **versions, "script": f"sha256 {text}"}
+    return {"commit": commit_of(script), **versions, "machine": machine, "threads": threads}
 
 
 # -------------------------------------------------------------------------------------------- playing whole games
-def play(policy: Policy, envs: VectorEnv, num_games: int, seed: list[int]) -> list[tuple[float, int]]:
-    """Plays whole games without learning, and returns (score, agent steps) of each. Games that do not end are left out.
+def play(
+    policy: Policy, envs: VectorEnv, num_games: int, seed: list[int], stop: StopSignal | None = None
+) -> list[tuple[float, int]]:
+    """Plays whole games without learning, and returns (score, agent steps) of each, fewer if `stop` notes a signal.
 
-    Each environment plays a fixed number of games; taking the first to finish would over-sample short ones.
+    Each environment plays a fixed number of games; taking the first to finish would over-sample short ones. Games that
+    do not end are left out.
     """
+    stop = stop or StopSignal()
     obs, _ = envs.reset(seed=env_seeds(seed, envs.num_envs))
     games = [[] for _ in range(envs.num_envs)]
     # Environment n plays the games n, n + N, n + 2N, … of all
     shares = [len(range(n, num_games, envs.num_envs)) for n in range(envs.num_envs)]
+    missing = lambda: any(len(played) < share for played, share in zip(games, shares, strict=True))  # noqa: E731
     steps_left = 27_000 * max(shares)  # Atari's longest games; other environments may have no time limit
-    while steps_left > 0 and any(len(played) < share for played, share in zip(games, shares, strict=True)):
+    while missing() and steps_left > 0 and not stop.number:
         steps_left -= 1
         obs, _, _, _, infos = envs.step(policy(obs))
         for n in np.flatnonzero(infos.get("_episode", False)):
             games[n].append((float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
-    return [game for played, share in zip(games, shares, strict=True) for game in played[:share]]
+    numbered = (divmod(number, envs.num_envs) for number in range(num_games))
+    return [games[n][turn] for turn, n in numbered if turn < len(games[n])]
 
 
-def evaluate(args, policy: Policy, run: RunDirectory, step: int) -> None:
+def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal | None = None) -> None:
     """Plays `args.eval_episodes` games with the policy of agent step `step`, and prints and logs their scores."""
     import torch
 
     torch.set_num_threads(args.threads)
-    envs = make_envs(args.env_id, min(args.num_envs, args.eval_episodes), args.threads)
-    games = play(policy, envs, args.eval_episodes, seed=[args.seed, 1])
+    envs = make_envs(args.env_id, args.num_envs, args.threads)  # however many games: so each has its number
+    games = play(policy, envs, args.eval_episodes, [args.seed, 1], stop)
     envs.close()
+    if stop is not None and stop.number:
+        return
     if len(games) < args.eval_episodes:
         say(f"{args.eval_episodes - len(games)} of {args.eval_episodes} games did not end, they are left out")
     scores = np.array([score for score, _ in games] or [math.nan])
     std = scores.std(ddof=1) if len(scores) > 1 else 0.0
     stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
     run.log_evaluation(games, stats, step)
-    print(f"{len(games)} games at step {step:,}:", *(f"{k} {v:.1f}" for k, v in stats.items()))
+    tell(f"{len(games)} games at step {step:,}: {' '.join(f'{name} {value:.1f}' for name, value in stats.items())}")
 
 
-def record_game(args, policy: Policy, run: RunDirectory, step: int) -> None:
-    """Plays one game into `videos/` of the run, with its score in the file's name."""
+def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal | None = None) -> None:
+    """Plays one game into `videos/` of the run, with its score in the file's name; none if `stop` notes a signal."""
     path = os.path.join(run.path, "videos", f"step_{step}")
     with run.reporting("the video"):
         os.makedirs(os.path.dirname(path), exist_ok=True)
         try:
             with contextlib.closing(make_envs(args.env_id, 1, args.threads, video=path + ".webm")) as envs:
-                scores = [score for score, _ in play(policy, envs, 1, seed=[args.seed, 2])]
-        except OSError:
+                scores = [score for score, _ in play(policy, envs, 1, [args.seed, 2], stop)]
+            if stop is None or not stop.number:
+                result = f"score_{scores[0]:.10g}" if scores else "without_end"
+                os.replace(path + ".webm", f"{path}_{result}.webm")
+        finally:
             with contextlib.suppress(OSError):
-                os.remove(path + ".webm")
-            raise
-        result = f"score_{scores[0]:.10g}" if scores else "without_end"
-        os.replace(path + ".webm", f"{path}_{result}.webm")
+                os.remove(path + ".webm")  # of a game cut short, or a full disk
 
 
-def record_game_if_due(args, new_policy: Callable[[], Policy], run: RunDirectory, iteration: int) -> None:
+def record_game_if_due(
+    args, new_policy: Callable[[], Policy], run: RunDirectory, iteration: int, stop: StopSignal
+) -> None:
     """Records a game at the start, at each quarter and at the end of the training, with `--capture-video`."""
-    if args.capture_video and iteration in [args.num_iterations * k // 4 for k in range(5)]:
-        record_game(args, new_policy(), run, iteration * args.batch_size)
+    if args.capture_video and not stop.number and iteration in [args.num_iterations * k // 4 for k in range(5)]:
+        record_game(args, new_policy(), run, iteration * args.batch_size, stop)
 
 
 # --------------------------------------------------------------------------------------------------- command line
+def parse(args_class: type, **given):
+    """Parses the command line. `--help` that has no reader, or no letter for ε, is no failure."""
+    if sys.stdout is None:  # closed before Python started
+        sys.stdout = open(os.devnull, "w", encoding="utf-8")
+    sys.stdout.reconfigure(errors="replace")
+    try:
+        try:
+            return tyro.cli(args_class, **given)
+        finally:
+            sys.stdout.flush()
+    except OSError:  # Python would flush again at its end, and fail
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        sys.exit()
+
+
 def open_run(args_class: type, description: str):
     """Chooses between training anew, resuming and evaluating, and refuses impossible calls with status 2.
 
@@ -522,24 +608,18 @@ def open_run(args_class: type, description: str):
     """
     # TensorBoard's thread prints a traceback if the disk is full; RunDirectory says it in one line
     threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
-    args = tyro.cli(args_class, description=description)
+    args = parse(args_class, description=description)
     stop = StopSignal()
-    stop.listen(None if args.evaluate is None else signal.SIG_DFL)
+    stop.listen()
     run = state = None
     name = "evaluate" if args.resume is None else "resume"
     if (directory := getattr(args, name)) is not None:
         run, state = RunDirectory.open(directory, name, args_class)
-        given = {"resume": args.resume, "evaluate": args.evaluate}
-        if name == "evaluate":  # these are the call's, not the run's
-            given |= {field: getattr(args_class(), field) for field in ("capture_video", "eval_episodes", "threads")}
-        args = tyro.cli(args_class, default=replace(args_class(**state["args"]), **given))
-        for field in ("env_id", "num_envs", "num_steps", "seed", "exp_name", "log_dir"):
-            if getattr(args, field) != state["args"][field]:
-                refuse(flag(field, getattr(args, field)), f"the run has {state['args'][field]}, which cannot change")
+        args = parse(args_class, default=replace(args_class(**state["args"]), **of_this_call(args, name)))
+        check_unchanged(args, state["args"], name)
     check(args)
     if args.resume is not None and state["iteration"] >= args.last_iteration:
-        limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
-        print(f"{args.resume} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")
+        tell(finished_text(args, run, state))
         sys.exit()
     try:
         envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
@@ -548,25 +628,59 @@ def open_run(args_class: type, description: str):
     except ValueError as error:
         refuse(flag("env_id", args.env_id), error)
     run = run or RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
+    if args.evaluate is None:
+        first, last = (state["global_step"] if state else 0), args.last_iteration * args.batch_size
+        say(f"{run.path}: from step {first:,} to {last:,}")
     return args, envs, run, state, stop
+
+
+def of_this_call(args, name: str) -> dict[str, object]:
+    """Returns the arguments that a resumed or evaluated run does not bring along."""
+    given = {"resume": args.resume, "evaluate": args.evaluate}
+    if name == "evaluate":
+        given |= {field: getattr(type(args)(), field) for field in ("capture_video", "eval_episodes", "threads")}
+    return given
+
+
+def check_unchanged(args, saved: dict[str, object], name: str) -> None:
+    """Refuses arguments that a run cannot change. An evaluation may have another seed, for other games."""
+    for field in ("env_id", "num_envs", "num_steps", "seed", "exp_name", "log_dir"):
+        given, has = getattr(args, field), saved[field]
+        if field == "log_dir":
+            given, has = os.path.realpath(given), os.path.realpath(has)
+        if given != has and not (field == "seed" and name == "evaluate"):
+            refuse(flag(field, getattr(args, field)), f"the run has {saved[field]}, which cannot change")
+
+
+def call_of(args, *words: str) -> str:
+    """Returns the command that calls this script with other words, from any directory."""
+    return shlex.join([sys.executable, os.path.abspath(inspect.getfile(type(args))), *words])
+
+
+def finished_text(args, run: RunDirectory, state: dict) -> str:
+    limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
+    text = f"{run.path} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further"
+    if limit == "--total-timesteps" and not os.path.exists(os.path.join(run.path, "eval.csv")):
+        text += f"; it is not evaluated, do that with: {call_of(args, '--evaluate', os.path.abspath(run.path))}"
+    return text
 
 
 def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
     """Ends a call whose agent is trained or loaded: evaluates it, or says how to go on. Exits with its status."""
-    stop.listen(signal.SIG_DFL)  # there is nothing left to save
-    step = run.iteration * args.batch_size
-    stopped = stop.number != 0 and run.iteration < args.last_iteration
-    call = lambda *words: shlex.join([sys.executable, inspect.getfile(type(args)), *words])  # noqa: E731
-    if stopped:
+    path, step = os.path.abspath(run.path), run.iteration * args.batch_size
+    done = args.evaluate is not None or run.iteration >= args.last_iteration
+    wanted = args.evaluate is not None or (run.iteration == args.num_iterations and args.eval_episodes > 0)
+    evaluated = False
+    if wanted and not stop.number and not run.not_written:
+        evaluate(args, new_policy(), run, step, stop)
+        evaluated = not stop.number
+        if args.evaluate is not None and args.capture_video:  # a training has filmed its last agent already
+            record_game(args, new_policy(), run, step, stop)
+    if not done and stop.number:
         stop_at = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
-        say(f"Stopped; go on with: {call('--resume', run.path, *stop_at)}")
-    elif args.evaluate is not None:
-        evaluate(args, new_policy(), run, step)
-        if args.capture_video:
-            record_game(args, new_policy(), run, step)
-    elif run.iteration == args.num_iterations and args.eval_episodes > 0:
-        if stop.number or run.not_written:
-            say(f"Finished, but not evaluated; do that with: {call('--evaluate', run.path)}")
-        else:
-            evaluate(args, new_policy(), run, step)
-    sys.exit(128 + stop.number if stopped else 1 if run.not_written else 0)
+        say(f"Stopped; go on with: {call_of(args, '--resume', path, *stop_at)}")
+    elif wanted and not evaluated:
+        say(f"Not evaluated; do that with: {call_of(args, '--evaluate', path)}")
+    elif done and not wanted and run.iteration < args.num_iterations:
+        say(f"At --stop-at; go on with: {call_of(args, '--resume', path)}")
+    sys.exit(128 + stop.number if stop.number and (wanted or not done) else 1 if run.not_written else 0)

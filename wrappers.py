@@ -64,7 +64,7 @@ def make_envs(
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other screens,
         float32 (N, D) for all others. Rewards: float32 signs for Atari, as they are elsewhere.
         After a step in which games have ended, and no other, `info["_episode"]` (N,) is true for those and
-        `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; where one was
+        `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; if one was
         truncated, `info["final_obs"]` holds the observation that it ended on (other rows are not to be read).
 
     Raises:
@@ -91,7 +91,7 @@ def make_envs(
         "use_fire_reset": False,  # would press FIRE before the no-ops, and never after a lost life
     }
     envs = AtariVectorEnv(rom, num_envs, img_height=SCREEN[0], img_width=SCREEN[1], stack_num=STACK, **options)
-    if video is not None:  # at the bottom, where the actions are those that the games get
+    if video is not None:  # at the bottom, to see the actions that the games get
         in_colour = {"grayscale": False, "img_height": 210, "img_width": 160, "stack_num": 1}
         twin = AtariVectorEnv(rom, num_envs, **in_colour, **options)  # same seeds, same actions: the same games
         envs = RecordVideo(envs, video, 60 / FRAME_SKIP, twin)
@@ -103,8 +103,8 @@ def make_envs(
 def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int]:
     """Returns a seed for each environment, drawn from one `SeedSequence`: runs with neighbouring seeds share none.
 
-    A run that has been started `starts` times before gets the next numbers of its sequence, for new games; what is
-    played beside the training has sequences of its own, `[seed, 1]` for evaluations and `[seed, 2]` for videos.
+    A run that has been started `starts` times before gets the next numbers of its sequence, for new games; games
+    played beside the training have sequences of their own, `[seed, 1]` for evaluations and `[seed, 2]` for videos.
     Gymnasium's own rule, seed, seed + 1, …, gives run 2 seven of the eight environments of run 1. 31 bits, because
     ale-py refuses larger ones.
     """
@@ -112,10 +112,42 @@ def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int
     return [int(number) for number in numbers[-num_envs:]]
 
 
+class WithoutInfo(gym.Wrapper):
+    """Drops an environment's own infos: keys such as `episode` or `final_obs` would be taken for the wrappers' here."""
+
+    def reset(self, **given):
+        return self.env.reset(**given)[0], {}
+
+    def step(self, action):
+        return (*self.env.step(action)[:4], {})
+
+
+class FiniteObservations(VectorWrapper):
+    """Raises FloatingPointError at an observation that is not finite, which no network can take."""
+
+    def reset(self, **given):
+        obs, infos = self.env.reset(**given)
+        self.num_steps = 0
+        return self.checked(obs), infos
+
+    def step(self, actions: np.ndarray):
+        obs, *rest = self.env.step(actions)
+        self.num_steps += 1
+        return (self.checked(obs), *rest)
+
+    def checked(self, obs: np.ndarray) -> np.ndarray:
+        if not (finite := np.isfinite(obs).all(axis=1)).all():
+            number = np.flatnonzero(~finite)[0]
+            raise FloatingPointError(
+                f"the observation of environment {number} is not finite after {self.num_steps} steps"
+            )
+        return obs
+
+
 class RecordVideo(VectorWrapper):
     """Writes the first game of the first environment to a WebM file (VP9): in colour, without sound, in real time.
 
-    Shows the screens of `twin`, games in lockstep with the agent's, or what the environments render. The last screen
+    Shows the screens of `twin`, games in lockstep with the agent's, or the environments' own renders. The last screen
     of a game is there only with a twin: others have already been reset when they can be asked.
     """
 
@@ -124,7 +156,7 @@ class RecordVideo(VectorWrapper):
         self.path, self.fps, self.twin, self.video = path, fps, twin, None
 
     def reset(self, *, seed=None, options=None):
-        """Begins the file anew. Raises OSError where it cannot be written."""
+        """Begins the file anew. Raises OSError if it cannot be written."""
         obs, infos = self.env.reset(seed=seed, options=options)
         screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed)[0][0, 0]
         import cv2  # here, because it changes the environment variables of whoever imports it
@@ -156,7 +188,7 @@ class RecordVideo(VectorWrapper):
             self.video.write(np.ascontiguousarray(screen[..., ::-1]))  # OpenCV takes blue first
 
     def finish(self) -> None:
-        """Ends the file. Raises OSError where it is not whole, which OpenCV does not say: the disk may be full."""
+        """Ends the file. Raises OSError if it is not whole, which OpenCV does not say: the disk may be full."""
         if self.video is None:
             return
         self.video.release()
@@ -177,8 +209,12 @@ class RecordVideo(VectorWrapper):
 
 @contextlib.contextmanager
 def silent() -> Iterator[None]:
-    """Keeps what C code prints in its body from standard error."""
-    kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    """Keeps the prints of C code in its body from standard error."""
+    try:
+        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+    except OSError:  # it is closed, and silent anyway
+        yield
+        return
     try:
         os.dup2(nowhere, 2)
         yield
@@ -189,11 +225,11 @@ def silent() -> Iterator[None]:
 
 
 class EpisodicLife(VectorWrapper):
-    """Reports a lost life as a termination while the game goes on, and presses FIRE where a life starts.
+    """Reports a lost life as a termination while the game goes on, and presses FIRE when a life starts.
 
-    A lost life is the fall of `info["lives"]` to a number above 0: the last one ends the game itself, and Frogger
-    shows 0 lives for many frames before it does. Games without lives (Pong, DoubleDunk) always show 0. No reset
-    follows, so the next observation is the next one of the same game.
+    A lost life is the fall of `info["lives"]` to a number above 0, as CleanRL and Stable-Baselines3 count it: the last
+    one ends the game itself. Frogger and BankHeist show 0 during the last life, so its start is not reported. Games
+    without lives (Pong, DoubleDunk) always show 0. No reset follows, so the next observation is the same game's.
 
     FIRE replaces the first action of each game and each life, in games that have FIRE: Breakout would stand still
     until the time limit without it. For the learner, that is an environment whose first action has no effect.
@@ -203,12 +239,15 @@ class EpisodicLife(VectorWrapper):
         super().__init__(envs)
         action_set = envs.unwrapped.ale.get_action_set()
         self.fire = action_set.index(ale_py.Action.FIRE) if ale_py.Action.FIRE in action_set else None
+        self.life_starts = np.zeros(self.num_envs, dtype=bool)
 
     def reset(self, *, seed: Sequence[int] | int | None = None, options: dict | None = None):
+        """Resets all games, or those that a mask names, `options={"reset_mask": …}` (N,)."""
+        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         # ale-py takes an int or an array, Gymnasium's SyncVectorEnv an int or a list
         obs, infos = self.env.reset(seed=np.array(seed) if isinstance(seed, Sequence) else seed, options=options)
         self.lives = infos["lives"]
-        self.life_starts = np.ones(self.num_envs, dtype=bool)
+        self.life_starts |= mask
         return obs, infos
 
     def step(self, actions: np.ndarray):
@@ -224,7 +263,7 @@ class EpisodicLife(VectorWrapper):
 
 
 def find_atari_game(env_id: str) -> tuple[str, float] | None:
-    """Returns the ROM's name and the probability of sticky actions, or None where `env_id` is not an Atari name.
+    """Returns the ROM's name and the probability of sticky actions, or None if `env_id` is not an Atari name.
 
     Raises:
         ValueError: an Atari name that cannot be played under the protocol of `make_envs`.
@@ -249,6 +288,12 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
             f"use {spec.name}, or {spec.id} for sticky actions"
         )
     return spec.kwargs["game"], 0.0
+
+
+def canonical_name(env_id: str) -> str:
+    """Returns a game's name as ale-py spells it (`pong`, `PONG` and `Pong-v5`'s kin are `Pong`); other ids stay."""
+    rom, repeat_action_probability = find_atari_game(env_id) or ("", None)
+    return atari_specs()[rom.replace("_", "")].name if repeat_action_probability == 0 else env_id
 
 
 def is_atari(spec: EnvSpec) -> bool:
@@ -282,8 +327,9 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
                 **({} if video is None else {"render_mode": "rgb_array"}),
             )
             envs.reset()  # an environment that cannot start is refused here, too
-            if video is not None and envs.render()[0] is None:
-                raise ValueError("no video can be made of it, it does not render to rgb_array")
+            if video is not None and np.shape(screen := envs.render()[0])[2:] != (3,):
+                shown = "nothing" if screen is None else f"arrays of shape {np.shape(screen)}"
+                raise ValueError(f"no video can be made of it, it renders {shown}, not (height, width, 3)")
     except gym.error.UnregisteredEnv as error:
         raise ValueError(suggest(prefix, name)) from error
     except Refused:
@@ -293,7 +339,9 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
         reason = str(error).replace("use `", f"use `{prefix}") or type(error).__name__  # Gymnasium, of another version
         raise ValueError(f"it cannot be {verb}: {reason}") from error
     if video is not None:
-        envs = RecordVideo(envs, video, envs.metadata.get("render_fps", 30))
+        envs = RecordVideo(envs, video, envs.metadata.get("render_fps") or 30)
+    if len(envs.single_observation_space.shape) == 1:
+        envs = FiniteObservations(envs)
     return RecordEpisodeStatistics(envs)
 
 
@@ -340,6 +388,7 @@ def preprocess(env: gym.Env) -> gym.Env:
     obs_space, action_space = env.observation_space, env.action_space
     if not isinstance(action_space, Discrete):
         raise Refused(f"its actions are {action_space}; only Discrete actions are supported")
+    env = WithoutInfo(env)
     start, dtype = int(action_space.start), action_space.dtype  # the scripts count actions from 0, in int64
     env = TransformAction(env, lambda action: dtype.type(action + start), Discrete(int(action_space.n)))
 

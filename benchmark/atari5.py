@@ -4,9 +4,9 @@
     python benchmark/atari5.py --seeds 1 --stop-at 200000            # the first 4 % of ten of them
     python benchmark/atari5.py --address auto --out /shared/results  # on the nodes of a Ray cluster
 
-The same command again goes on where the last one stopped: finished runs are skipped, others resumed from their
-checkpoints. A run that fails is resumed once, then reported, and the rest goes on; the runs of a node that dies go on
-elsewhere; Ctrl-C leaves every run resumable. With a larger `--stop-at` the same curves become longer.
+The same command again goes on: finished runs are skipped, others are resumed from their checkpoints. A run that fails
+is resumed once, then reported, and the rest goes on; the runs of a node that dies go on elsewhere; Ctrl-C leaves every
+run resumable. With a larger `--stop-at` the same curves become longer.
 
 Each run is one process of a script, started by a Ray task (`pip install -e '.[benchmark]'`). OUT/runs gets the runs'
 own directories, OUT/logs what each of them was started with and has printed. Exit status: 0 all done, 1 some failed,
@@ -60,7 +60,7 @@ COMMON_FLAGS = ["--eval-episodes", "0"]  # the measure is the thesis's, the last
 LOCK_SECONDS = 120
 MOST_DEATHS = 10  # of the workers and nodes of one run; more, and it may be the run that kills them
 SILENCE_SECONDS = 300  # in which a running script has said something, as it does each minute
-PROGRESS = re.compile(r"step ([\d,]+) of [\d,]+, (\d+) SPS(?:, score (-?[\d.]+))?")  # what a script says each minute
+PROGRESS = re.compile(r"step ([\d,]+) of [\d,]+, (\d+) SPS(?:, score (-?[\d.]+))?")  # a script says this each minute
 
 
 @dataclass
@@ -90,10 +90,10 @@ class Args:
     figures: bool = True
     """draw the figures once all runs are done"""
     dry_run: bool = False
-    """print what would be run, and run nothing"""
+    """print the commands and run nothing"""
 
 
-# Not a method: what stands in Args and Run travels to Ray's workers, which may not find bookkeeping.py
+# Not a method: methods of Args and Run travel to Ray's workers, which may not find bookkeeping.py
 def check(args: Args) -> None:
     """Ends the program with status 2 at the first argument that cannot work."""
     for name in ("games", "seeds", "variants"):
@@ -154,7 +154,7 @@ class Run:
         return max((args.out / "runs").glob(f"{self.name}__*/checkpoint.pt"), default=None)
 
     def command(self, args: Args) -> list[str]:
-        """Returns what starts it, or takes it further."""
+        """Returns the command that starts it, or takes it further."""
         script, flags = VARIANTS[self.variant]
         if checkpoint := self.checkpoint(args):
             which = {"resume": checkpoint.parent}
@@ -194,7 +194,7 @@ class Run:
 
 
 def tail(log: Path, after: int = 0) -> str:
-    """Returns the last 4 kB of a log, of what is beyond `after` bytes; nothing if there is none yet."""
+    """Returns the last 4 kB of a log, from `after` bytes on; nothing if there is none yet."""
     try:
         with log.open("rb") as file:
             file.seek(max(after, file.seek(0, os.SEEK_END) - 4096))
@@ -213,7 +213,7 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
     """
     # Ray's cancel interrupts by this signal, which a worker ignores if the driver does, as under `nohup … &`
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    # Ray sets this for its workers; a run shall see what it would see without Ray
+    # Ray sets this for its workers; a run shall see the same as without Ray
     environment = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
     if omp_num_threads is not None:
         environment["OMP_NUM_THREADS"] = omp_num_threads
@@ -228,7 +228,7 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
                     return "another process is training it; call again when it has ended"
                 time.sleep(0.5)  # not a blocking flock: Ray's cancel could not end that
         for _ in range(2):
-            command = run.command(args)  # now, as the lock is held and what there is to resume is whole
+            command = run.command(args)  # now that the lock is held, and the checkpoint is whole
             log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {platform.node()}$ {shlex.join(command)}\n".encode())
             log.flush()
             if (status := run_process(command, environment, log)) == 0:
@@ -278,8 +278,9 @@ def run_grid(runs: list[Run], args: Args) -> None:
     try:
         try:
             ray.init(args.address or "local", **quiet, **({} if args.address else cores))
-        except (ConnectionError, ValueError, RuntimeError) as error:
-            refuse(f"--address {args.address or 'local'}", f"Ray does not start there ({str(error).splitlines()[0]})")
+        except (OSError, ValueError, RuntimeError) as error:
+            advice = "" if args.address else "; set RAY_TMPDIR or TMPDIR to a short path that can be written"
+            refuse(f"--address {args.address or 'local'}", f"Ray does not start ({str(error).splitlines()[0]}){advice}")
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # after init, which sets the second
             if signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets the third
                 signal.signal(number, signal.default_int_handler)

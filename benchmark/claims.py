@@ -48,7 +48,7 @@ FINISHED = 0.9  # of its schedule
 FEWEST_PAIRS = 3
 UNDECIDED, TOO_EARLY = "cannot be told apart with these runs", "too early"
 OF_ITERATIONS = ("{:+.2%}".format, "{} of all iterations")
-# Claim → what it says; how a margin across games is written, and what is said of it
+# Claim → its sentence; the format of a margin across games, and the sentence around it
 CLAIMS = {
     "score": ("AC-PPO's final score is above PPO's", "{:+.3f}".format, "{} of human minus random score"),
     "KL": (
@@ -134,7 +134,7 @@ def pairs(curves: Curves, game: str) -> list[tuple[pd.DataFrame, pd.DataFrame]]:
 def epsilons(runs: pd.DataFrame) -> dict[str, float]:
     """Returns each variant's ε, its widest clip range; with c = inf the range has no bound, and it has none here."""
     arguments = {run.variant: json.loads(run.arguments) for run in runs.itertuples()}
-    return {name: args["clip_coef"] for name, args in arguments.items() if math.isfinite(args.get("c", 0))}
+    return {name: args["clip_coef"] for name, args in arguments.items() if math.isfinite(float(args.get("c", 0)))}
 
 
 # -------------------------------------------------------------------------------------------------- statistics
@@ -367,7 +367,7 @@ def progress_table(curves: Curves, parts: int = 10) -> str:
 
 
 def spikes_table(curves: Curves, most: int = 10) -> str:
-    """The largest KLs of each run, and what else was special at those iterations."""
+    """The largest KLs of each run, and the other curves at those iterations."""
     columns = "kl times learning_rate entropy explained_variance clipfrac max_tv_distance max_ratio_advantage games"
     headings = "KL, × median, learning rate, entropy, explained variance, clip fraction, largest TV distance"
     headings += ", largest abs((ρ − 1)Â), games ended"

@@ -128,7 +128,7 @@ def read_curve(readers: list[EventAccumulator]) -> pd.DataFrame:
 
 
 def read_provenance(readers: list[EventAccumulator]) -> list[dict[str, str]]:
-    """Returns what each start of a run wrote of itself to TensorBoard, from the first to the last."""
+    """Returns the provenance that each start of a run wrote to TensorBoard, from the first to the last."""
     tag, texts = "provenance/text_summary", []
     for reader in readers:
         texts += reader.Tensors(tag) if tag in reader.Tags()["tensors"] else []

@@ -1,4 +1,4 @@
-"""The thesis's figures and tables, and what becomes of its claims: everything that the grid's event files give.
+"""The thesis's figures and tables, and the verdicts on its claims, from the grid's event files.
 
     python benchmark/figures.py
     python benchmark/figures.py --out ../another-grid
@@ -91,7 +91,7 @@ class Args:
 
 
 def frames_per_step(game: str) -> int:
-    """Returns the emulator frames of an agent step: 4 on Atari, 1 elsewhere, where a step is all there is."""
+    """Returns the emulator frames of an agent step: 4 on Atari, 1 elsewhere."""
     return FRAME_SKIP if find_atari_game(game) else 1
 
 

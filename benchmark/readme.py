@@ -13,7 +13,7 @@ def markdown(columns: list[str], rows: list[list[str]]) -> str:
 
 
 def split_readme(readme: Path, name: str) -> tuple[str, str, str] | None:
-    """Returns what stands before the generated part, the part, and what follows; None if it has no such part, once."""
+    """Returns the text before the generated part, the part, and the text after it; None unless it is there once."""
     try:
         text = readme.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError):

@@ -55,7 +55,7 @@ def main(logdir: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path]
         refuse(str(logdir), "no event files in it")
     port = free_port()
     module = [sys.executable, "-m", "tensorboard.main", "--logdir", str(logdir), "--port", str(port)]
-    # --load_fast=false: the other reader shows what it has read so far, and the picture would come too early
+    # --load_fast=false: the other reader shows a part of the points at first, and the picture would come too early
     with subprocess.Popen([*module, "--load_fast=false"], stderr=subprocess.DEVNULL) as server:
         try:
             # Its runs are listed once the event files have been read

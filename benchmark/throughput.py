@@ -122,7 +122,7 @@ def read_csv(path: Path) -> tuple[list[str], list[dict[str, str]]]:
 
 
 def add_rows(path: Path, rows: list[dict[str, object]]) -> None:
-    """Adds rows to a CSV, and a column for each phase that it has not had; what a row lacks stays empty."""
+    """Adds rows to a CSV, and a column for each phase that it has not had; cells without a value stay empty."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if not os.access(path if path.exists() else path.parent, os.W_OK):
@@ -152,7 +152,7 @@ class Contender:
 
 
 def make_contenders(args: Args) -> list[Contender]:
-    """Turns the command line into contenders, the scripts first; what cannot be run ends the program."""
+    """Turns the command line into contenders, the scripts first. Refuses contenders that cannot be run."""
     torch, contenders = importlib.metadata.version("torch"), []
     for i, given in enumerate(args.contenders):
         try:
@@ -206,7 +206,7 @@ class Iteration:
     phases: dict[str, float]  # seconds by tag; empty for peers
 
 
-Run = dict[str, float]  # what one process gave, by CSV column; a peer's has no phases
+Run = dict[str, float]  # the measurements of one process, by CSV column; a peer's has no phases
 
 
 @dataclass
@@ -234,9 +234,9 @@ class Row:
 
 
 def read_iterations(directory: Path) -> list[Iteration]:
-    """Reads the event file somewhere under `directory`; an iteration ends when `charts/SPS` is logged."""
-    file = next(directory.rglob("events.out.tfevents*"), directory)
-    reader = EventAccumulator(str(file), size_guidance={"scalars": 0})  # 0: every point
+    """Reads the run somewhere under `directory`; an iteration ends when `charts/SPS` is logged."""
+    run = next(directory.rglob("events.out.tfevents*"), directory / "none").parent
+    reader = EventAccumulator(str(run), size_guidance={"scalars": 0})  # 0: every point
     reader.Reload()
     if "charts/SPS" not in (logged := reader.Tags()["scalars"]):
         return []
@@ -264,12 +264,12 @@ def measure(iterations: list[Iteration], start: float, end: float) -> Run:
 
 
 def run_process(row: Row, needed: int, directory: Path) -> tuple[list[Iteration], Run]:
-    """Runs one job for `needed` iterations, and returns them with what only the process as a whole can tell."""
+    """Runs one job for `needed` iterations, and returns them with the measurements of the whole process."""
     contender, threads = row.contender, str(max(1, row.threads // row.jobs))
     command = [*contender.command, "--num-envs", str(row.num_envs)]
     command += ["--total-timesteps", str(row.num_envs * NUM_STEPS * needed)]
     environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", **contender.environment}
-    if contender.peer:  # has no flags for these: torch takes its threads from here, and `runs` is made where it stands
+    if contender.peer:  # has no flags for these: torch reads its threads here, and `runs` is in the working directory
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
     else:
         command += ["--threads", threads, "--log-dir", str(directory)]
@@ -277,8 +277,8 @@ def run_process(row: Row, needed: int, directory: Path) -> tuple[list[Iteration]
     with (directory / "stderr").open("w+", encoding="utf-8", errors="replace") as stderr:
         started = time.time()
         child = subprocess.Popen(command, **place, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=stderr)
-        # Peak memory of this child alone. Linux counts what its parent held when it started, so a run never shows
-        # less than this program holds: torch is left to the probes' own processes.
+        # Peak memory of this child alone. Linux counts the memory that its parent held when it
+        # started, so a run never shows less than this program holds: torch is left to the probes' own processes.
         _, status, usage = os.wait4(child.pid, 0)
         child.returncode = os.waitstatus_to_exitcode(status)
         stderr.seek(0)
@@ -302,7 +302,7 @@ def run_jobs(row: Row, args: Args) -> list[Run]:
 
 
 def last_words(stderr: str) -> str:
-    """Returns the last line, or the first in the box that tyro draws around what is wrong and what to read."""
+    """Returns the last line, or the first in the box that tyro draws around an error."""
     box = re.search(r"^╭.*\n│(.*)│$", stderr, re.MULTILINE)
     return (box[1] if box else (stderr.strip() or "no message").splitlines()[-1]).strip()
 
@@ -403,7 +403,7 @@ def main() -> None:
     args.check()
     contenders = make_contenders(args)
     add_rows(args.csv, [])  # last, so that nothing refused above leaves a file behind
-    # The contenders of one setting follow each other, so that what is compared most is closest in time
+    # The contenders of one setting follow each other, so that the closest comparisons are closest in time
     settings = itertools.product(args.num_envs, args.threads, args.jobs)
     rows = [Row(contender, *setting) for setting in settings for contender in contenders]
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""

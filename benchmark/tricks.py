@@ -77,7 +77,7 @@ def rollout_step(groups: int) -> Callable:
 
 
 def tricks() -> dict[str, tuple[Callable, Callable]]:
-    """Returns the pairs to compare: what it is, the plain form, the trick."""
+    """Returns the pairs to compare: name, plain form, trick."""
     nhwc = torch.randint(0, 256, (4 * MINIBATCH, 84, 84, 4), dtype=torch.uint8)
     chosen = torch.randperm(4 * MINIBATCH)[:MINIBATCH]
     last = nhwc[:MINIBATCH].movedim(-1, 1)  # (B, 4, 84, 84) in channels-last layout

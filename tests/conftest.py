@@ -1,7 +1,8 @@
-"""What several test files share: the scripts, in this process and in their own, and what a run has logged."""
+"""Helpers of several test files: the scripts, in this process and in their own, and the logs of a run."""
 
 import contextlib
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -24,7 +25,7 @@ from wrappers import make_envs
 
 ROOT = Path(__file__).parent.parent
 SCRIPTS = {"ppo": ppo_atari, "acppo": acppo_atari}
-MEASURED_IN_SECONDS = ("charts/SPS", "time/")  # what two equal runs do not share
+MEASURED_IN_SECONDS = ("charts/SPS", "time/")  # two equal runs differ in these
 TINY_PIXELS = "tiny_envs:TinyPixels-v0"
 SHORT_CARTPOLE = "tiny_envs:ShortCartPole-v0"
 SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
@@ -43,7 +44,7 @@ def each_script(request):
     return request.param
 
 
-# ------------------------------------------------------------------------------------------- what a run leaves behind
+# ---------------------------------------------------------------------------------------------- the logs of a run
 def scalars(run_dir) -> dict[str, list[tuple[int, float]]]:
     """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points.
 
@@ -82,7 +83,7 @@ def open_run(script, path):
 
 
 def train(script, run_dir, **arguments) -> dict[str, list[tuple[int, float]]]:
-    """Trains without the checks of the command line, and returns what was logged."""
+    """Trains without the checks of the command line, and returns the logged scalars."""
     args = script.Args(**{"threads": 1, **arguments})
     run_dir = Path(run_dir)
     run_dir.mkdir(parents=True, exist_ok=True)
@@ -96,7 +97,7 @@ def flags_of(**arguments) -> list[str]:
 
 
 class Ended(NamedTuple):
-    """How a call of a script ended; `err` is without the line a minute that says how far the run is."""
+    """How a call of a script ended; `err` is without the lines that say where a run is and how far."""
 
     status: int
     out: str
@@ -105,7 +106,7 @@ class Ended(NamedTuple):
     @classmethod
     def with_output(cls, status: int, out: str, err: str) -> "Ended":
         lines = err.splitlines(keepends=True)
-        return cls(status, out, "".join(line for line in lines if not line.startswith("step ")))
+        return cls(status, out, "".join(line for line in lines if not re.match(r"step |\S+: from step ", line)))
 
 
 @pytest.fixture

@@ -2,11 +2,11 @@
 
     python tests/faults.py                           # all of them, a row of a Markdown table each
     python tests/faults.py --only 'clip|learning'    # those whose words match
-    python tests/faults.py --fast -n 2               # the plain suite alone; what is not known here goes to pytest
+    python tests/faults.py --fast -n 2               # the plain suite alone; unknown flags go to pytest
 
 The tests that a fault names are tried first, then the whole plain suite, then the slow tests. That the two scripts
 are siblings would give away every fault in one of them, so it is made in both, and tests/test_siblings.py does not
-count except where a fault names it.
+count unless a fault names it.
 """
 
 import argparse
@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# What is wrong | where | the tests to be tried first; then the text that goes and the text that comes, as in a diff
+# Fault | file | the tests to be tried first; then the text that goes and the text that comes, as in a diff
 FAULTS = r"""
 a termination does not cut the bootstrap | both scripts | test_mathematics.py
 -gamma * next_values * ~terminations - values
@@ -167,7 +167,7 @@ the random state is not taken from the checkpoint | bookkeeping.py | test_resume
 +pass
 
 a run's directory is not locked | bookkeeping.py | test_resume.py -k two_processes
--fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+-self.lock.acquire(blocking=False)
 +pass
 
 event files keep what was logged after the checkpoint | bookkeeping.py | test_playing.py -k rid_of
@@ -204,8 +204,8 @@ an evaluation draws from the training's random numbers | both scripts | test_pla
 +act(agent, from_envs(obs, device))
 
 an evaluation plays the games that the training began with | bookkeeping.py | test_playing.py -k other_games_than
--seed=[args.seed, 1])
-+seed=[args.seed])
+-[args.seed, 1], stop)
++[args.seed], stop)
 
 a run is finished only at a step that no whole rollout reaches | benchmark/atari5.py | test_atari5.py -k whole_rollout
 -min(args.total_timesteps // rollout * rollout,
@@ -249,7 +249,7 @@ def read_faults() -> list[Fault]:
 
 
 def copy_with(fault: Fault, directory: Path) -> None:
-    """Copies what git tracks, as it is in the working tree, and makes the fault in it."""
+    """Copies the tracked files, as they are in the working tree, and makes the fault in the copy."""
     names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
     for name in filter(None, names.split("\0")):
         (directory / name).parent.mkdir(parents=True, exist_ok=True)
@@ -261,7 +261,7 @@ def copy_with(fault: Fault, directory: Path) -> None:
 
 
 def first_failure(directory: str, *arguments: str) -> str | None:
-    """Returns the id of the first test that fails, None where none does."""
+    """Returns the id of the first test that fails, None if none does."""
     command = [
         sys.executable,
         "-m",

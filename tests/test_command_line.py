@@ -1,18 +1,23 @@
-"""The scripts as a user runs them: smoke runs as processes, what they log, and how bad input is refused."""
+"""The scripts as a user runs them: smoke runs as processes, their curves, and refusals of bad input."""
 
 import contextlib
+import json
 import math
 import re
+import shlex
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+import tyro
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
-from bookkeeping import TENSORBOARD_LAYOUT, check
+from bookkeeping import TENSORBOARD_LAYOUT, check, command_line, commit_of, file_name
 from conftest import PATIENCE, ROOT, SHORT_CARTPOLE, SMALL, TINY_PIXELS, flags_of, run_dir_in, scalars
 
 
@@ -23,7 +28,7 @@ def documented_tags() -> set[str]:
 
 
 def check_a_run_of_two_iterations(script, env_id: str, run_dir: Path) -> None:
-    """Asserts that it has logged every documented tag with finite values, and said what it is."""
+    """Asserts that it has logged every documented tag with finite values, and described itself."""
     exp_name = Path(script.__file__).stem
     assert re.fullmatch(rf"{re.escape(env_id.replace(':', '-'))}__{exp_name}__1__\d+", run_dir.name)
     logged = scalars(run_dir)
@@ -67,6 +72,70 @@ def test_two_runs_that_start_in_the_same_second_get_two_directories(script, tmp_
     assert names == [start + second for second in ("1234567890", "1234567891", "1234567892")]
 
 
+@pytest.mark.parametrize(
+    ("env_id", "name"),
+    [
+        ("pong", "Pong"),
+        ("PongNoFrameskip-v4", "Pong"),
+        ("name_this_game", "NameThisGame"),
+        ("CartPole-v1", "CartPole-v1"),
+    ],
+)
+def test_a_run_directory_has_the_game_in_its_one_spelling(script, env_id, name, tmp_path):
+    with contextlib.closing(script.RunDirectory.make(script.Args(env_id=env_id, log_dir=str(tmp_path)))) as run:
+        assert Path(run.path).name.split("__")[0] == name
+
+
+ARGUMENTS = st.fixed_dictionaries(
+    {},
+    optional={
+        "env_id": st.text(min_size=1),
+        "log_dir": st.text(min_size=1),
+        "exp_name": st.from_regex(r"[A-Za-z0-9_.-]{1,20}", fullmatch=True),
+        "seed": st.integers(0, 2**64 - 1),
+        "gamma": st.floats(0, 1),
+        "c": st.one_of(st.just(math.inf), st.floats(0, 1e29)),
+        "target_kl": st.one_of(st.none(), st.floats(1e-300, 1e29)),
+        "norm_adv": st.booleans(),
+        "capture_video": st.booleans(),
+    },
+)
+
+
+@settings(deadline=None, database=None)
+@given(ARGUMENTS)
+def test_the_recorded_command_is_parsed_to_the_same_arguments(arguments):
+    args = acppo_atari.Args(**arguments)
+    python, script, *words = shlex.split(command_line(args))
+    assert (python, script) == ("python", "acppo_atari.py") and tyro.cli(acppo_atari.Args, args=words) == args
+
+
+def test_the_record_of_a_run_is_strict_json(tmp_path, call_main):
+    call_main(acppo_atari, *flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=128, eval_episodes=0, c="inf"))
+    text = (run_dir_in(tmp_path / "runs") / "args.json").read_text(encoding="utf-8")
+
+    def refuse(constant):
+        raise ValueError(constant)
+
+    assert json.loads(text, parse_constant=refuse)["args"]["c"] == "inf"
+
+
+@pytest.mark.parametrize(("file", "name"), [("a/my ppo (2).py", "my-ppo--2-"), ("ppo_atari.py", "ppo_atari")])
+def test_a_script_s_runs_are_named_after_its_file(file, name):
+    assert file_name(file) == name
+
+
+def test_the_commit_is_this_checkout_s_and_dirty_for_a_script_that_it_does_not_hold(tmp_path, monkeypatch):
+    monkeypatch.setenv("GIT_DIR", str(tmp_path))  # of another repository, as in a git hook
+    commit = commit_of(acppo_atari.__file__)
+    assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?", commit) or commit.startswith("unknown (")
+    if not commit.startswith("unknown ("):
+        (tmp_path / "my_ppo.py").write_text("")
+        assert commit_of(str(tmp_path / "my_ppo.py")) == commit.removesuffix("-dirty") + "-dirty"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert commit_of(acppo_atari.__file__).startswith("unknown (")  # git is not installed
+
+
 def test_help_explains_every_flag(script, monkeypatch, call_main):
     monkeypatch.setenv("COLUMNS", "200")
     status, out, err = call_main(script, "--help")
@@ -78,7 +147,7 @@ def test_help_explains_every_flag(script, monkeypatch, call_main):
 
 
 REFUSED = [
-    # (flags, the flag that is named, what is said)
+    # (flags, the flag that is named, the advice)
     (["--env-id", "Brekout"], "--env-id Brekout", "did you mean Breakout"),
     (["--env-id", "Brek\nout"], "--env-id Brek out", "unknown environment"),
     (["--env-id", "Pendulum-v1"], "--env-id Pendulum-v1", "only Discrete actions"),
@@ -104,7 +173,7 @@ def test_what_cannot_be_parsed_is_refused_too(script, tmp_path, call_main):
 
 NAN, INF = math.nan, math.inf
 BOUNDS = [
-    # (arguments, values that are refused, what is said, values that are not)
+    # (arguments, refused values, the advice, accepted values)
     (
         "total_timesteps num_envs num_steps num_minibatches update_epochs",
         [0, -1, 10**12 + 1],

@@ -1,4 +1,4 @@
-"""What makes the scripts fast does not change what they compute."""
+"""The tricks that make the scripts fast do not change their results."""
 
 import pytest
 import torch

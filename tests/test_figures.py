@@ -1,4 +1,4 @@
-"""The results: what is read from the logs, what is made of it, and what a call may touch."""
+"""The results: reading the logs, tables and figures, and the files that a call may touch."""
 
 import itertools
 import json
@@ -46,7 +46,7 @@ def log(directory, points: dict[str, dict[int, float]], suffix: str = "", time: 
 
 
 def make_csvs(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=()) -> None:
-    """Writes the two CSVs: (variant, game, seed) → column → a value an iteration; what is not given is 0.1.
+    """Writes the two CSVs: (variant, game, seed) → column → a value an iteration; columns not given are 0.1.
 
     Their schedule has as many iterations as the longest of them, or as `iterations` says.
     """
@@ -488,7 +488,7 @@ def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_pa
     assert made["README.md"].decode() == marks.replace("old\n", figures.results_part(stages))
     assert "](figures/beginnings/score.png)" in made["README.md"].decode()
     assert (tmp_path / "README.md").read_text(encoding="utf-8") == marks.replace("old\n", claims.short_table(stages))
-    assert not list(tmp_path.rglob("*new*"))  # nothing is left of what was written beside
+    assert not list(tmp_path.rglob("*new*"))  # no file is left beside those replaced
 
     before = contents(default) | {"above": (tmp_path / "README.md").read_bytes()}
     call(monkeypatch, "--out", tmp_path / "other")

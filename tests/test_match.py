@@ -1,4 +1,4 @@
-"""A bound is matched where the tried one clips as many samples, or moves the policy as far, as the other."""
+"""A bound matches if the variant clips as many samples, or moves the policy as far, as the other one."""
 
 import math
 import sys

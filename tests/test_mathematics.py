@@ -55,6 +55,18 @@ def test_gae_of_the_true_value_is_zero(each_script):
     assert advantages.abs().max() < 1e-12
 
 
+def test_gae_is_the_same_for_whole_number_rewards_of_any_dtype(each_script):
+    rewards, never = torch.tensor([[1], [0], [-1]]), torch.zeros(3, 1, dtype=torch.bool)
+    values = torch.tensor([[0.3], [0.2], [0.1]])
+    both = [each_script.compute_gae(r, values, values, never, never, 0.9, 0.8) for r in (rewards, rewards.float())]
+    assert torch.equal(*both) and both[0].abs().min() > 0.01
+
+
+def test_a_network_says_which_observations_it_takes(each_script):
+    with pytest.raises(ValueError, match=r"\(4, 64, 64\); give \(channels, 84, 84\) or \(size,\)"):
+        each_script.Agent((4, 64, 64), 6)
+
+
 def test_the_clip_range_of_ppo_is_epsilon_whatever_the_advantage():
     assert ppo_atari.clip_range(torch.tensor([-3.0, 0.0, 2.0]), 0.1).tolist() == pytest.approx([0.1] * 3)
 

@@ -6,6 +6,7 @@ import os
 import resource
 import shlex
 import signal
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -20,6 +21,7 @@ import bookkeeping
 import tiny_envs
 from bookkeeping import play, record_game
 from conftest import (
+    PATIENCE,
     ROOT,
     SHORT_CARTPOLE,
     SMALL,
@@ -72,7 +74,7 @@ class LastsAsLongAsItsNumber(VectorWrapper):
 
 
 @pytest.mark.parametrize(
-    ("num_games", "scores"), [(4, [0, 1, 2, 3]), (6, [0, 0, 1, 1, 2, 3]), (9, [0] * 3 + [1] * 2 + [2] * 2 + [3] * 2)]
+    ("num_games", "scores"), [(4, [0, 1, 2, 3]), (6, [0, 1, 2, 3, 0, 1]), (9, [0, 1, 2, 3] * 2 + [0])]
 )
 def test_every_environment_plays_its_share_however_short_its_games(script, num_games, scores):
     envs = LastsAsLongAsItsNumber(make_envs("CartPole-v1", 4))
@@ -101,7 +103,7 @@ def test_games_are_repeated_by_their_seed_and_leave_torchs_generator_alone(scrip
     ],
 )
 def test_training_is_the_same_with_and_without_videos_and_evaluation(script, env_id, tmp_path, monkeypatch, call_main):
-    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # pygame complains without, where there is no desktop
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))  # pygame complains without it if there is no desktop
     flags = flags_of(env_id=env_id, num_envs=2, num_steps=16, total_timesteps=128, update_epochs=1, threads=1)
     logged = []
     for name, extra in (("with", ["--capture-video", "--eval-episodes", "3"]), ("without", ["--eval-episodes", "0"])):
@@ -168,7 +170,7 @@ def test_what_cannot_be_rendered_is_refused_before_a_run_begins(script, tmp_path
 
 def test_a_checkpoint_is_evaluated_and_the_run_goes_on_after_it(script, tmp_path, call_main):
     stopped = call_main(script, *flags_of(**CARTPOLE, total_timesteps=512, stop_at=256))
-    assert stopped == (0, "", "")  # a run that stops on its way is not evaluated
+    assert stopped[:2] == (0, "")  # a run that stops on its way is not evaluated
     run_dir = run_dir_in(tmp_path / "runs")
     again = [call_main(script, "--evaluate", str(run_dir), "--eval-episodes", "5") for _ in range(2)]
     assert again[0].status == 0 and again[0] == again[1]
@@ -195,20 +197,37 @@ def test_a_killed_run_that_is_evaluated_is_still_rid_of_what_it_logged_after_its
     call_main(script, "--resume", str(run_dir), "--stop-at", "512")
     (run_dir / "checkpoint.pt").write_bytes(kept)  # as if the process had been killed before its next checkpoint
     assert call_main(script, "--evaluate", str(run_dir), "--eval-episodes", "2").status == 0
-    assert call_main(script, "--resume", str(run_dir), "--stop-at", "640") == (0, "", "")
+    assert call_main(script, "--resume", str(run_dir), "--stop-at", "640")[:2] == (0, "")
     logged = scalars(run_dir)
     assert [step for step, _ in logged["charts/learning_rate"]] == [128, 256, 384, 512, 640]
     assert [step for step, _ in logged["eval/mean"]] == [256]
 
 
-def test_a_signal_ends_an_evaluation_at_once(script, tmp_path, start):
-    """A million games without an end are not waited for."""
+def test_a_signal_ends_an_evaluation_between_two_agent_steps(script, tmp_path, start):
+    """A million games without an end are not waited for; how to play them later is said."""
     flags = {"total_timesteps": 128, "eval_episodes": 1_000_000}
     process = start(script, *flags_of(**{**CARTPOLE, "env_id": "tiny_envs:Endless-v0"}, **flags))
     process.wait_for((tmp_path / "step-100").exists)  # of a game of the evaluation: the training has 32 steps a game
     process.send_signal(signal.SIGTERM)
-    assert process.end() == (-signal.SIGTERM, "", "")
-    assert checkpoint_of(run_dir_in(tmp_path / "runs"))["global_step"] == 128
+    status, out, said = process.end()
+    run_dir = run_dir_in(tmp_path / "runs")
+    assert (status, out) == (128 + signal.SIGTERM, "") and said.endswith(f"--evaluate {run_dir}\n")
+    assert checkpoint_of(run_dir)["global_step"] == 128 and not (run_dir / "eval.csv").exists()
+
+
+def test_a_film_that_a_signal_cuts_short_leaves_no_file(script, tmp_path):
+    args, stop = script.Args(env_id=RENDERED, threads=1), bookkeeping.StopSignal()
+    policy, steps = policy_for(script, RENDERED), []
+
+    def policy_until_signal(obs):
+        steps.append(1)
+        stop.number = signal.SIGTERM if len(steps) == 5 else 0
+        return policy(obs)
+
+    with open_run(script, tmp_path) as run:
+        record_game(args, policy_until_signal, run, step=7, stop=stop)
+        assert len(steps) == 5 and not run.not_written
+    assert list(tmp_path.glob("videos/*")) == []
 
 
 def test_games_that_do_not_end_are_left_out(tmp_path, monkeypatch):
@@ -227,14 +246,14 @@ def recorded(script, run_dir, env_id: str) -> bool:
 
 
 def test_the_video_of_a_game_that_does_not_end_has_no_score(script, tmp_path, monkeypatch):
-    monkeypatch.setattr(bookkeeping, "play", lambda policy, envs, num_games, seed: envs.reset() and [])
+    monkeypatch.setattr(bookkeeping, "play", lambda policy, envs, num_games, seed, stop: envs.reset() and [])
     assert recorded(script, tmp_path, RENDERED)
     assert [path.name for path in tmp_path.glob("videos/*")] == ["step_7_without_end.webm"]
 
 
 @pytest.mark.parametrize("env_id", [RENDERED, pytest.param("Breakout", marks=pytest.mark.slow)])
 def test_a_video_that_the_disk_has_no_room_for_is_reported(script, env_id, tmp_path, capfd):
-    """No file may grow beyond half a video's size, which is what the disk says when it is full."""
+    """No file may grow beyond half a video's size: writes fail as on a full disk."""
     assert recorded(script, tmp_path, env_id)
     (video,) = tmp_path.glob("videos/step_7_score_*.webm")
     size = video.stat().st_size
@@ -292,14 +311,47 @@ def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, monkeyp
         "step 1,800 of 2,000, 50 SPS, score 1.5, 0:00:04 left\n"
     )
     monkeypatch.setattr(os, "isatty", lambda descriptor: True)
+    monkeypatch.setenv("COLUMNS", "45")
     line.show(args, 19, sps=50.0, last_scores=[])
     line.show(args, 20, sps=50.0, last_scores=[])
     clear = "\r\x1b[K"
     shown = f"{clear}step 1,900 of 2,000, 50 SPS, 0:00:02 left{clear}step 2,000 of 2,000, 50 SPS, 0:00:00 left\n"
     assert capfd.readouterr().err == shown
+    monkeypatch.setenv("COLUMNS", "20")
+    line.show(args, 19, sps=50.0, last_scores=[])
+    assert capfd.readouterr().err == f"{clear}step 1,900 of 2,000"
     monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it if the shell closed it: 2>&-
     line.show(args, 20, sps=50.0, last_scores=[])
     assert capfd.readouterr().err == ""
+
+
+def test_a_game_of_an_evaluation_is_the_same_however_many_are_played(script, tmp_path, call_main):
+    train(script, tmp_path / "run", **CARTPOLE, total_timesteps=128)
+    for num_games in ("1", "3", "6", "10"):
+        assert call_main(script, "--evaluate", "run", "--eval-episodes", num_games).status == 0
+    with open(tmp_path / "run" / "eval.csv", encoding="utf-8") as file:
+        games = [(row["game"], row["score"]) for row in csv.DictReader(file)]
+    assert len(games) == 20 and len(set(games)) == 10
+
+
+def test_another_seed_evaluates_other_games(script, tmp_path, call_main):
+    train(script, tmp_path / "run", **CARTPOLE, total_timesteps=128)
+    flags = ("--evaluate", "run", "--eval-episodes", "4")
+    first, again, other = (call_main(script, *flags, "--seed", seed) for seed in ("1", "1", "2"))
+    assert first.status == other.status == 0 and first == again and first.out != other.out
+
+
+def test_a_result_that_nobody_reads_is_no_failure(script, tmp_path, call_main):
+    """Standard output is full, as `/dev/full` is, or its reader is gone, as after `| head -1`."""
+    train(script, tmp_path / "run", **CARTPOLE, total_timesteps=128)
+    for flags in (["--evaluate", str(tmp_path / "run"), "--eval-episodes", "2"], ["--help"]):
+        command = [sys.executable, script.__file__, *flags]
+        with open("/dev/full", "w") as full:
+            ascii_alone = {**os.environ, "PYTHONIOENCODING": "ascii"}
+            ended = subprocess.run(
+                command, env=ascii_alone, stdout=full, stderr=subprocess.PIPE, text=True, timeout=PATIENCE
+            )
+        assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_what_standard_error_cannot_take_does_not_end_the_run():
@@ -332,7 +384,9 @@ def test_evaluations_and_films_play_other_games_than_the_training(script, tmp_pa
     args = script.Args(env_id=RENDERED, threads=1, eval_episodes=1)
     policy, seeds = policy_for(script, RENDERED), []
     monkeypatch.setattr(
-        bookkeeping, "play", lambda policy, envs, num_games, seed: seeds.append(seed) or envs.reset() and [(1.0, 1)]
+        bookkeeping,
+        "play",
+        lambda policy, envs, num_games, seed, stop: seeds.append(seed) or envs.reset() and [(1.0, 1)],
     )
     with open_run(script, tmp_path) as run:
         bookkeeping.evaluate(args, policy, run, step=0)

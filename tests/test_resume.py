@@ -7,6 +7,7 @@ import random
 import re
 import shutil
 import signal
+import sys
 import time
 from collections import Counter
 from pathlib import Path
@@ -18,6 +19,7 @@ from hypothesis import strategies as st
 from tbparse import SummaryReader
 from torch.utils.tensorboard import SummaryWriter
 
+import bookkeeping
 from conftest import (
     SCRIPTS,
     SMALL,
@@ -50,7 +52,9 @@ def test_stopped_and_resumed_logs_what_straight_through_logs(script, env_id, tmp
     assert call_main(script, *flags, "--log-dir", "straight").status == 0
     stopped = call_main(script, *flags, "--log-dir", "stopped", "--stop-at", "600")
     run_dir = run_dir_in(tmp_path / "stopped")
-    assert stopped == (0, "", "") and checkpoint_of(run_dir)["global_step"] == 640
+    assert stopped[:2] == (0, "") and checkpoint_of(run_dir)["global_step"] == 640
+    command = f"{sys.executable} {script.__file__} --resume {run_dir}"  # from any directory
+    assert stopped.err == f"At --stop-at; go on with: {command}\n"
     status, played, said = call_main(script, "--resume", f"stopped/{run_dir.name}")
     assert (status, said) == (0, "") and played.startswith("10 games at step 1,280")
 
@@ -96,7 +100,7 @@ def test_a_resumed_run_plays_games_that_it_has_not_played(script, tmp_path, monk
 
 
 def killed_and_resumed(script, tmp_path, start, call_main, kills: int) -> dict:
-    """Kills a run with SIGKILL at random instants, resumes it each time, and returns what was logged.
+    """Kills a run with SIGKILL at random instants, resumes it each time, and returns the logged scalars.
 
     A checkpoint is due after every iteration, so that many kills fall into the writing of one; none may lose more than
     the iteration in progress.
@@ -118,7 +122,7 @@ def killed_and_resumed(script, tmp_path, start, call_main, kills: int) -> dict:
         assert newest_step(tmp_path) >= saved
         saved = newest_step(tmp_path)
         flags = ["--resume", str(run_dir)]
-    assert call_main(script, *flags, "--stop-at", str(saved + 5 * ITERATION)) == (0, "", "")
+    assert call_main(script, *flags, "--stop-at", str(saved + 5 * ITERATION))[:2] == (0, "")
     return scalars(run_dir)
 
 
@@ -212,6 +216,20 @@ def test_a_directory_without_a_checkpoint_is_refused(script, contents, tmp_path,
     assert ("it holds no checkpoint" if contents is None else "damaged") in said
 
 
+def test_a_run_is_found_by_its_checkpoint_and_named_if_its_parent_is_given(script, finished, tmp_path, call_main):
+    status, out, err = call_main(script, "--resume", "finished/checkpoint.pt")
+    assert (status, err) == (0, "") and out.startswith("finished is finished up to --total-timesteps")
+    assert f"not evaluated, do that with: {sys.executable} {script.__file__} --evaluate {finished}" in out
+    said = f"--resume {tmp_path}: it holds no checkpoint; give a run in it: finished\n"
+    assert call_main(script, "--resume", str(tmp_path)) == (2, "", said)
+
+
+def test_the_same_log_dir_in_another_spelling_is_no_change(script, tmp_path, call_main):
+    call_main(script, *flags_of(**CARTPOLE, total_timesteps=256, stop_at=128, log_dir="runs"))
+    resumed = call_main(script, "--resume", str(run_dir_in(tmp_path / "runs")), "--log-dir", str(tmp_path / "runs"))
+    assert resumed.status == 0
+
+
 def test_a_directory_that_is_not_there_is_refused(script, call_main):
     assert call_main(script, "--resume", "nowhere") == (2, "", "--resume nowhere: No such file or directory\n")
 
@@ -281,18 +299,49 @@ def test_a_signal_ends_the_run_with_a_checkpoint_and_the_command_to_go_on(script
     process.send_signal(number)
     status, out, said = process.end()
     run_dir = run_dir_in(tmp_path / "runs")
-    assert (status, out) == (128 + number, "") and said.endswith(f"--resume runs/{run_dir.name} --stop-at 500000000\n")
+    assert (status, out) == (128 + number, "") and said.endswith(f"--resume {run_dir} --stop-at 500000000\n")
     assert checkpoint_of(run_dir)["global_step"] == scalars(run_dir)[EVERY_ITERATION][-1][0] > 0
 
 
-def test_a_second_signal_ends_at_once(script, tmp_path, start):
+def test_a_second_signal_a_second_later_ends_at_once(script, tmp_path, start):
     """An agent step that takes an hour is not waited for."""
     process = start(script, *flags_of(**{**CARTPOLE, "env_id": "tiny_envs:Stuck-v0"}, **CANNOT_END))
     process.wait_for((tmp_path / "stuck").exists)
     process.send_signal(signal.SIGINT)
-    assert "once more" in process.stderr.readline()
+    assert "from step 0" in process.stderr.readline() and "another signal" in process.stderr.readline()
+    time.sleep(1.1)
     process.send_signal(signal.SIGTERM)
-    assert process.end() == (-signal.SIGTERM, "", "")
+    assert process.end() == (128 + signal.SIGTERM, "", "")
+
+
+def test_two_signals_at_once_count_as_one(monkeypatch, capfd):
+    """Launchers send the same signal to a process and to its group."""
+    clock, ended = [100.0], []
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(os, "_exit", ended.append)
+    stop = bookkeeping.StopSignal()
+    for clock[0] in (100.0, 100.003, 100.9):
+        stop.note(signal.SIGTERM, None)
+    assert (stop.number, ended) == (signal.SIGTERM, []) and capfd.readouterr().err.count("\n") == 1
+    clock[0] = 101.0
+    stop.note(signal.SIGINT, None)
+    assert ended == [128 + signal.SIGINT]
+
+
+def test_a_signal_that_is_ignored_at_the_start_stays_ignored(monkeypatch):
+    """As after `nohup`, and in the background of a plain `sh`."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)}
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        stop = bookkeeping.StopSignal()
+        stop.listen()
+        os.kill(os.getpid(), signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN and stop.number == 0
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.number == signal.SIGTERM
+    finally:
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @pytest.mark.parametrize("where", ["value_loss", "surrogate"])
@@ -324,7 +373,7 @@ def bytes_after(script, directory: Path, iterations: int) -> tuple[int, int]:
     ],
 )
 def test_a_full_disk_is_said_once_and_training_goes_on(script, too_large, tmp_path, start):
-    """No file may grow beyond a limit, which is what the disk says when it is full."""
+    """No file may grow beyond a limit: writes fail as on a full disk."""
     first, events_before = bytes_after(script, tmp_path / "measured 0", 0)
     later, events_after = bytes_after(script, tmp_path / "measured 5", 5)
     iterations = 5
@@ -389,7 +438,7 @@ names = st.sampled_from(
     ["CartPole-v1", "Acrobot-v1", TINY_PIXELS, "Brekout", "Pendulum-v1", "a:b:c", "", "\n", "ALE/", "-"]
 )
 NUMBERS = "learning_rate gamma gae_lambda clip_coef vf_clip_coef ent_coef vf_coef max_grad_norm target_kl seed".split()
-ODD = {  # what any flag might be given
+ODD = {  # odd values for any flag
     **dict.fromkeys(("num_envs", "num_steps", "num_minibatches", "update_epochs"), sizes),
     **dict.fromkeys((*NUMBERS, "checkpoint_minutes", "stop_at"), numbers),
     "total_timesteps": st.integers(-1, 700),

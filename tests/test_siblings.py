@@ -7,7 +7,7 @@ import acppo_atari
 import ppo_atari
 from conftest import ROOT
 
-PLACES = {  # what a hunk may touch: lines from the one to the other, the second not included
+PLACES = {  # places that a hunk may touch: lines from the one to the other, the second not included
     "docstring": ('"""', "Sections: "),
     "Args": ("class Args:", "@property"),
     "clip_range": ("def clip_range(", "def surrogate("),

@@ -1,7 +1,7 @@
 """The thesis's bounds on small random MDPs that are solved exactly; `policy_change` measures the distances.
 
 (2.12) and theorem 2.3.2 are printed with s ~ d_π̃ on both sides; the second is s ~ d_π, as the proof of theorem 3.1.1
-has it, and that is what is tested.
+has it, and the tests follow the proof.
 """
 
 import numpy as np

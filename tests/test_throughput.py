@@ -1,4 +1,4 @@
-"""The speed measurements: what is made of the numbers, how they are read, and one call as a user makes it."""
+"""The speed measurements: how the numbers are read, their tables, and one call as a user makes it."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Whole trainings in this process: what must be equal, what must be zero, and every logged number worked out again."""
+"""Whole trainings in this process: equalities, zeros, and every logged number worked out again."""
 
 import time
 
@@ -117,7 +117,7 @@ def test_a_target_kl_skips_the_remaining_epochs(script, tmp_path, monkeypatch):
 
 
 class Recorder:
-    """Keeps what one of a script's functions was given and what it returned, each time it is called."""
+    """Keeps the arguments and results of one of a script's functions."""
 
     def __init__(self, monkeypatch, script, name: str):
         self.calls, function = [], getattr(script, name)

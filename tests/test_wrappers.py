@@ -1,6 +1,7 @@
 """The environments: real games step by step against a reference, names, seeds, and what is refused."""
 
 import importlib.metadata
+import math
 import sys
 
 import ale_py
@@ -8,7 +9,7 @@ import cv2
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.spaces import Discrete, flatdim
+from gymnasium.spaces import Box, Discrete, flatdim
 from gymnasium.spaces.utils import flatten
 
 from tiny_envs import NUMBERS
@@ -312,3 +313,74 @@ def test_runs_with_neighbouring_seeds_share_no_environment_seed():
     assert len(set(seeds)) == len(seeds)
     assert all(type(number) is int and 0 <= number < 2**31 for number in seeds)
     assert env_seeds(1, 8) == env_seeds(1, 8)
+
+
+class OwnInfos(gym.Env):
+    """Has infos of its own under names that the wrappers use; a game is ten steps of reward 1."""
+
+    observation_space, action_space = Box(-math.inf, math.inf, (1,), np.float64), Discrete(2)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": None}
+
+    def __init__(self, render_mode: str | None = None, observation=0.0, screen=None):
+        self.render_mode, self.observation, self.screen = render_mode, observation, screen
+
+    def infos(self) -> dict:
+        return {"episode": {"r": 0.0, "l": 0}, "_episode": 3, "final_obs": "none", "lives": 2}
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(1), self.infos()
+
+    def step(self, action):
+        self.steps += 1
+        observation = np.array([self.observation if self.steps == 7 else 0.0])
+        return observation, 1.0, self.steps == 10, False, self.infos()
+
+    def render(self):
+        return self.screen
+
+
+@pytest.fixture
+def own_infos():
+    gym.register("OwnInfos-v0", OwnInfos)
+    yield lambda **given: gym.registry["OwnInfos-v0"].kwargs.update(given)
+    del gym.registry["OwnInfos-v0"]
+
+
+def test_only_the_scores_that_the_wrappers_measure_count(own_infos):
+    envs = make_envs("OwnInfos-v0", 2)
+    envs.reset(seed=[1, 2])
+    infos = [envs.step(np.array([0, 1]))[-1] for _ in range(10)]
+    assert all("episode" not in info for info in infos[:-1])
+    assert infos[-1]["episode"]["r"].tolist() == [10, 10] and infos[-1]["_episode"].all()
+
+
+@pytest.mark.filterwarnings("ignore:overflow")
+@pytest.mark.parametrize("observation", [math.nan, math.inf, 1e300])  # the last is finite in float64 alone
+def test_an_observation_that_is_not_finite_is_told_by_environment_and_step(own_infos, observation):
+    own_infos(observation=observation)
+    envs = make_envs("OwnInfos-v0", 2)
+    envs.reset(seed=[1, 2])
+    with pytest.raises(FloatingPointError, match="environment 0 is not finite after 7 steps"):
+        for _ in range(7):
+            envs.step(np.array([0, 1]))
+
+
+@pytest.mark.parametrize("shape", [(8, 8), (8, 8, 4)])
+def test_pictures_that_no_video_can_show_are_refused(own_infos, shape, tmp_path):
+    own_infos(screen=np.zeros(shape, np.uint8))
+    with pytest.raises(ValueError, match="not \\(height, width, 3\\)"):
+        make_envs("OwnInfos-v0", 1, video=str(tmp_path / "none.webm"))
+    own_infos(screen=np.zeros((8, 8, 3), np.uint8))
+    assert make_envs("OwnInfos-v0", 1, video=str(tmp_path / "none.webm")).env.env.fps == 30  # metadata says None
+
+
+def test_a_reset_of_some_games_presses_fire_in_those_alone():
+    envs = make_envs("Breakout", 2)
+    envs.reset(seed=env_seeds(1, 2))
+    for _ in range(3):
+        envs.step(np.zeros(2, int))
+    assert envs.env.life_starts.tolist() == [False, False]
+    envs.reset(options={"reset_mask": np.array([False, True])})
+    assert envs.env.life_starts.tolist() == [False, True]

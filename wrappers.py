@@ -37,7 +37,7 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 
 gym.register_envs(ale_py)
-OWN_IDS = set(gym.registry)  # Gymnasium's and ale-py's; other packages add theirs later
+OWN_IDS = list(gym.registry)  # Gymnasium's and ale-py's; other packages add theirs later
 
 FRAME_SKIP = 4  # emulator frames shown for each agent step
 SCREEN = (84, 84)  # height and width of an observation, pixels
@@ -61,7 +61,7 @@ def make_envs(
         video: a WebM file that the first game of the first environment is written to, from each `reset` on.
 
     Returns:
-        A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other images,
+        A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other screens,
         float32 (N, D) for all others. Rewards: float32 signs for Atari, as they are elsewhere.
         After a step in which games have ended, and no other, `info["_episode"]` (N,) is true for those and
         `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; if one was
@@ -350,39 +350,34 @@ class Refused(ValueError):
 
 
 def import_registrations(module: str, name: str) -> None:
-    """Imports an id's module, if it has one, and makes the calls that packages declare for registering environments.
-
-    They are entry points `gymnasium.envs`, named after a namespace: Gymnasium made these calls itself before 1.0.
-    """
+    """Imports an id's module, if any, and makes the calls that packages declare for registering environments."""
     if module:
         if os.getcwd() not in sys.path:
             sys.path.append(os.getcwd())  # last, so that nothing in it hides a package
         try:
             importlib.import_module(module)
         except Exception as error:  # whatever a foreign module raises
-            advice = "install its package, or start in the directory that it lies in"
-            raise Refused(f"module {module} cannot be imported: {type(error).__name__}: {error}; {advice}") from error
+            raise Refused(f"module {module} cannot be imported ({error!r}); install it or start beside it") from error
     if name not in gym.registry:
-        package, namespace = module.split(".")[0], name.rpartition("/")[0]
-        for entry_point in importlib.metadata.entry_points(group="gymnasium.envs"):
-            if entry_point.module.split(".")[0] == package or entry_point.name == namespace:
-                entry_point.load()()
+        for call in importlib.metadata.entry_points(group="gymnasium.envs"):  # which Gymnasium made until 1.0
+            if call.module.split(".")[0] == module.split(".")[0] or call.name == name.rpartition("/")[0]:
+                call.load()()
 
 
 def suggest(prefix: str, name: str) -> str:
     """Says that an id, of a module or none, is unknown, and what to write instead."""
-    names = [] if prefix else [spec.name for spec in atari_specs().values()]
-    for known, spec in gym.registry.items():
-        if known not in OWN_IDS or not (prefix or spec.namespace or is_atari(spec)):
-            names.append(known)
-    by_lower = {known.lower(): known for known in names}
+    games = [] if prefix else [spec.name for spec in atari_specs().values()]
+    own = [] if prefix else [i for i in OWN_IDS if "/" not in i and not is_atari(gym.registry[i])]
+    by_lower = {known.lower(): known for known in [*games, *own, *(i for i in gym.registry if i not in OWN_IDS)]}
     close = [prefix + by_lower[known] for known in difflib.get_close_matches(name.lower(), by_lower, n=3)]
     said = f"module {prefix[:-1]} was imported, but registers no {name}" if prefix else "unknown environment"
     if close:
-        return f"{said}; did you mean {' or '.join(close)}?"
-    if prefix:
-        return f"{said}; if one of its functions does, call that in a module of your own, and use my_module:{name}"
-    return f"{said}; use a game such as Breakout, CartPole-v1, or module:Env-v0 for an environment of a module"
+        advice = f"did you mean {' or '.join(close)}?"
+    elif prefix:
+        advice = f"if one of its functions does, call that in a module of your own, and use my_module:{name}"
+    else:
+        advice = "use a game such as Breakout, CartPole-v1, or module:Env-v0 for an environment of a module"
+    return f"{said}; {advice}"
 
 
 def preprocess(env: gym.Env) -> gym.Env:

@@ -185,7 +185,7 @@ def test_every_registered_game_is_found_by_its_bare_name():
         ("tiny_envs:ShowsDeep-v0", r"its observations\[1\]\['links'\] are Graph and .*\[1\]\['turns'\] are Sequence"),
         ("tiny_envs:ShowsEither-v0", "its observations are OneOf, not numbers"),
         ("tiny_envs:ShowsEmpty-v0", "its observations are empty"),
-        ("no_such_module:Env-v0", "no_such_module cannot be imported: .*; install its package, or start in the dir"),
+        ("no_such_module:Env-v0", "no_such_module cannot be imported .*No module named .*; install it or start beside"),
         ("tiny_envs:TinyPixel-v0", "tiny_envs was imported.* no TinyPixel-v0; did you mean tiny_envs:TinyPixels-v0"),
         ("json:Xyz-v0", "json was imported.* no Xyz-v0; if one of its functions does, call that in a module of your"),
         ("Taxi-v3", "use `Taxi-v4`"),
@@ -255,7 +255,7 @@ def test_a_module_may_lie_in_the_current_directory(tmp_path, monkeypatch):
     )
     assert make_envs("lies_here:LiesHere-v0", 1).single_observation_space.shape == (4,)
     (tmp_path / "broken.py").write_text("1 / 0\n")
-    with pytest.raises(ValueError, match="broken cannot be imported: ZeroDivisionError"):
+    with pytest.raises(ValueError, match=r"broken cannot be imported \(ZeroDivisionError"):
         make_envs("broken:Env-v0", 1)
 
 

@@ -223,7 +223,12 @@ class RunDirectory:
         if os.path.basename(path) == "checkpoint.pt":
             path = os.path.dirname(path) or "."
         try:
-            if name == "resume" and not os.access(path, os.W_OK) and os.path.isdir(path):
+            in_it = {file.name: file.path for file in os.scandir(path)}
+            if "checkpoint.pt" not in in_it:  # asked before the lock, which leaves a file
+                runs = sorted(run for run in in_it if os.path.exists(os.path.join(in_it[run], "checkpoint.pt")))
+                advice = f"give a run in it: {' '.join(runs)}" if runs else "start the run anew"
+                raise ValueError(f"it holds no checkpoint; {advice}")
+            if name == "resume" and not os.access(path, os.W_OK):
                 raise ValueError("it cannot be written")
             run = cls(path)
             return run, run.load(args_class)
@@ -239,15 +244,9 @@ class RunDirectory:
         self.lock.release()
 
     def load(self, args_class: type) -> dict:
-        """Returns the checkpoint. Raises ValueError if there is none, or none of a script with these arguments."""
+        """Returns the checkpoint. Raises ValueError if it is not one of a script with these arguments."""
         import torch
 
-        if not os.path.exists(self.checkpoint):
-            runs = [
-                name for name in sorted(os.listdir(self.path)) if os.path.exists(f"{self.path}/{name}/checkpoint.pt")
-            ]
-            advice = f"give a run in it: {' '.join(runs)}" if runs else "start the run anew"
-            raise ValueError(f"it holds no checkpoint; {advice}")
         try:
             with zipfile.ZipFile(self.checkpoint) as archive:
                 whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters

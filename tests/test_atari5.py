@@ -27,16 +27,30 @@ def grid_command(out: Path, *flags: str) -> list[str]:
     return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *cores, *flags]
 
 
+STARTED = []
+
+
+@pytest.fixture(scope="module", autouse=True)
+def no_grid_outlives_the_tests():
+    """Of a test that fails, too."""
+    yield
+    for driver in STARTED:
+        if driver.poll() is None:
+            driver.terminate()
+            driver.communicate()
+
+
 def start(out: Path, *flags: str, sigint=signal.SIG_DFL) -> subprocess.Popen:
     # SIGINT: a suite that runs in the background of a script ignores it, as would all that it starts.
     # cwd: outside the repository, because Ray's workers get the driver's.
     own = {"preexec_fn": lambda: signal.signal(signal.SIGINT, sigint), "start_new_session": True, "cwd": out}
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(grid_command(out, *flags), **own, **pipes)
+    STARTED.append(subprocess.Popen(grid_command(out, *flags), **own, **pipes))
+    return STARTED[-1]
 
 
 def has_logged(event_file: Path) -> bool:
-    return b"losses/kl" in event_file.read_bytes()
+    return b"charts/learning_rate" in event_file.read_bytes()  # which the layout of TensorBoard's page does not name
 
 
 def both_log(out: Path) -> bool:

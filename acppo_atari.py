@@ -16,10 +16,14 @@ Sections: arguments, network, mathematics, training, command line.
 """
 
 import math
+import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
+
+if __name__ == "__main__" and signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the imports without a traceback
 
 import bookkeeping
 

@@ -120,9 +120,7 @@ def write_text(path: str | os.PathLike, text: str) -> None:
 
 
 def tune_process() -> None:
-    """Sets up a process that trains, before it imports torch: how it ends, how threads wait, how memory is kept."""
-    if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)  # no traceback out of an import; `open_run` listens later
+    """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
     # Idle OpenMP threads would spin on the cores that the games' threads need
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping

@@ -6,6 +6,7 @@ import math
 import os
 import re
 import shlex
+import signal
 import subprocess
 import sys
 import time
@@ -237,6 +238,18 @@ def test_arguments_at_the_edge_of_going_together_are_taken(script):
 def test_importing_a_script_leaves_the_environment_alone():
     probe = "import os; before = dict(os.environ); import ppo_atari, acppo_atari; assert os.environ == before"
     subprocess.run([sys.executable, "-c", probe], cwd=ROOT, check=True, timeout=PATIENCE)
+
+
+def test_ctrl_c_during_the_imports_ends_without_a_traceback(script, tmp_path):
+    """In the place of a package that is imported early stands a file that interrupts its own process."""
+    (tmp_path / "filelock.py").write_text(
+        "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    restore = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}  # if ignored out here
+    command = [sys.executable, script.__file__]
+    ended = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=PATIENCE, **restore)
+    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, "", "")
 
 
 def test_nothing_that_only_posix_has_is_needed_to_import_and_train(tmp_path):

@@ -103,7 +103,7 @@ class Args:
     seed: NonNegativeInt = 1
     """seed of torch, and of a SeedSequence that gives each environment a seed of its own"""
     torch_deterministic: bool = True
-    """have cuDNN choose deterministic algorithms (CleanRL); on a CPU, seed and thread count determine the run"""
+    """have cuDNN choose deterministic algorithms (CleanRL); on one machine's CPU, seed and threads determine the run"""
     cuda: bool = True
     """use a GPU if there is one"""
     threads: Threads = field(default_factory=bookkeeping.available_cores)
@@ -126,7 +126,8 @@ class Args:
     evaluate: str | None = None
     """evaluate the checkpoint in this run directory for `--eval-episodes` games, without training"""
     resume: str | None = None
-    """go on with the run in this directory, with its saved arguments; flags given as well override them"""
+    """go on with the run in this directory, with its saved arguments; flags given as well override
+    them, but for game, rollout, seed and names"""
     stop_at: PositiveInt | None = None
     """end this call at this many agent steps (rounded up to whole rollouts), with a checkpoint; the schedule stays that
     of the whole run"""
@@ -341,7 +342,7 @@ def train(
     # eps as in OpenAI's baselines, not torch's 1e-8; fused: 1.3 ms a step, not 5.7 (benchmark/tricks.py)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     iterations_done = run.start(args, state, agent, optimizer)
-    run.save(args, iterations_done, agent, optimizer)  # so that a new run can be resumed at once, and this start counts
+    run.save(args, iterations_done, agent, optimizer)  # to be resumed from at once; counts this start
     new_policy = partial(make_policy, agent, args.seed)  # a fresh generator for each film
     bookkeeping.record_game_if_due(args, new_policy, run, iterations_done, stop)
 
@@ -428,7 +429,7 @@ def train(
                 with torch.no_grad():
                     approx_kl = ((ratio - 1) - logratio).mean()
                     clipfrac = ((ratio - 1).abs() > clip).float().mean()  # each sample against its own range
-                    avg_clip_ratio = clip.clamp(max=1).mean()  # above 1 it never binds below; --c inf makes it infinite
+                    avg_clip_ratio = clip.clamp(max=1).mean()  # a range above 1 has no lower end
                 stats = {"policy_loss": pg_loss, "value_loss": v_loss, "entropy": entropy, "clipfrac": clipfrac}
                 stats |= {"avg_clip_ratio": avg_clip_ratio, "minibatch_approx_kl": approx_kl}
                 minibatch_stats.append(torch.stack(list(stats.values())).detach())

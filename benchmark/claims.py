@@ -398,5 +398,6 @@ def short_table(stages: list[Stage]) -> str:
         row = [game, str(len(both)), last_step(stage.compared, game)]
         row += [over_seeds(final) if len(final) else "–" for final in finals]
         row.append(f"{math.exp(margins['KL'][game].mean()):.2f}")
-        table.append([*row, judge(margins["score"][game]) if stage.final else TOO_EARLY])
-    return markdown(["game", "n", "steps", "PPO", "AC-PPO", "KL of PPO / AC-PPO", "AC-PPO scores more"], table)
+        judged = judge(margins["score"][game]).replace(SIGNS[UNDECIDED], "undecided:") + " pairs"
+        table.append([*row, judged if stage.final else TOO_EARLY])
+    return markdown(["game", "n", "steps", "PPO", "AC-PPO", "PPO's KL ÷ AC-PPO's", "AC-PPO scores more"], table)

@@ -389,7 +389,8 @@ def readme_table(directory: Path = RESULTS) -> str:
             setting = "{env_id}, {num_envs} environments, {threads} threads, torch {torch}"
             settings[setting.format(**runs[0])] = None
     columns = ["processor", "script", "steps/s", "× CleanRL", "× Stable-Baselines3", "peak MB"]
-    said = f"{'; '.join(settings)}: median (minimum to maximum) of rounds in turn, ratios round by round."
+    said = f"{'; '.join(settings)}: median (minimum to maximum) over rounds. "
+    said += "A round runs each script once; a ratio is taken within one."
     return markdown(columns, table) + f"\n{said}\n"
 
 

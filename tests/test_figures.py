@@ -367,7 +367,7 @@ def test_before_90_percent_of_the_schedule_it_is_too_early_for_a_final_score_and
     assert "interquartile" in figures.stage_tables(finished)["score"]
     assert "interquartile" not in figures.stage_tables(early)["score"]
     assert [row[-1] for row in cells(claims.short_table([early]))[2:]] == ["too early"] * 2
-    assert [row[-1] for row in cells(claims.short_table([finished]))[2:]] == ["✓ 3 of 3"] * 2
+    assert [row[-1] for row in cells(claims.short_table([finished]))[2:]] == ["✓ 3 of 3 pairs"] * 2
 
 
 def test_the_short_table_has_the_pairs_of_each_game_s_most_advanced_stage(tmp_path):
@@ -378,7 +378,7 @@ def test_the_short_table_has_the_pairs_of_each_game_s_most_advanced_stage(tmp_pa
     runs |= {("ppo", "Breakout", 1): part, ("acppo", "Breakout", 1): part, ("ppo", "Breakout", 2): part}
     assert cells(claims.short_table(make_stages(tmp_path, runs)))[2:] == [
         ["Breakout", "1", "2,048", "7.0", "7.0", "1.00", "too early"],
-        ["Pong", "1", "3,072", "3.0", "3.0", "2.00", "? 0 of 1, 1 equal"],
+        ["Pong", "1", "3,072", "3.0", "3.0", "2.00", "undecided: 0 of 1, 1 equal pairs"],
     ]
 
 

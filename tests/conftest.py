@@ -152,7 +152,8 @@ class Process(subprocess.Popen):
     def __init__(self, script, *flags: str, cwd: Path, file_size: int | None = None):
         """Starts it; no file that it writes can grow beyond `file_size` bytes, as if the disk were full."""
 
-        def limit() -> None:
+        def prepare() -> None:
+            signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a suite in the background of a script ignores
             resource.setrlimit(resource.RLIMIT_CPU, (PATIENCE, PATIENCE))  # an endless run must not outlive its tests
             if file_size is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
@@ -164,7 +165,7 @@ class Process(subprocess.Popen):
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
-            preexec_fn=limit,
+            preexec_fn=prepare,
         )
 
     def wait_for(self, condition) -> None:

@@ -14,6 +14,7 @@ import ctypes
 import hashlib
 import importlib.metadata
 import inspect
+import io
 import itertools
 import json
 import math
@@ -25,7 +26,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 import typing
 import zipfile
@@ -119,6 +119,18 @@ def write_text(path: str | os.PathLike, text: str) -> None:
         raise
 
 
+def append(path: str, data: bytes) -> None:
+    """Appends to a file, which may not exist yet: all of `data`, or nothing and OSError."""
+    size = os.path.getsize(path) if os.path.exists(path) else 0
+    try:
+        with open(path, "ab") as file:
+            file.write(data)
+    except OSError:
+        with contextlib.suppress(OSError):
+            os.truncate(path, size) if size else os.remove(path)
+        raise
+
+
 def tune_process() -> None:
     """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
     # Idle OpenMP threads would spin on the cores that the games' threads need
@@ -191,8 +203,7 @@ class RunDirectory:
         self.lock = filelock.FileLock(os.path.join(path, "run.lock"))
         if os.access(path, os.W_OK):
             self.lock.acquire(blocking=False)
-        self.writer = None
-        self.waiting = False  # True after a failure, until a checkpoint could be written; points are dropped meanwhile
+        self.event_file: EventFile | None = None  # of this start
         self.not_written: set[str] = set()
         self.iteration = 0  # of the last checkpoint
         self.num_starts = 0  # each start of a run plays games of its own
@@ -237,8 +248,6 @@ class RunDirectory:
 
     def close(self) -> None:
         """Lets go of the directory, for another process or object to open it."""
-        if self.writer is not None:
-            self.writer.close()
         self.lock.release()
 
     def load(self, args_class: type) -> dict:
@@ -295,6 +304,8 @@ class RunDirectory:
 
     def describe(self, args, step: int) -> None:
         """Writes the run's arguments and provenance to `args.json` and TensorBoard, and the layout of its page."""
+        from torch.utils.tensorboard import summary
+
         about = {
             "command": command_line(args),
             "started_at_step": step,  # above 0 for a resumed run, which the command does not repeat
@@ -304,41 +315,43 @@ class RunDirectory:
         }
         with self.reporting("args.json"):
             write_text(os.path.join(self.path, "args.json"), json.dumps(about, indent=2))
-        with self.reporting("the event file"), self.logging() as writer:
-            writer.add_custom_scalars(TENSORBOARD_LAYOUT)
-            provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
-            for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
-                table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
-                writer.add_text(tag, "\n".join(table), step)
+        summaries = [summary.custom_scalars(TENSORBOARD_LAYOUT)]
+        provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
+        for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
+            table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
+            summaries.append(summary.text(tag, "\n".join(table)))
+        self.append_events([(step, summary) for summary in summaries])
 
     def log(self, step: int, scalars: dict[str, float], games: list[tuple[int, float, int]] = ()) -> None:
         """Writes scalars at an agent step, and games as (agent step, score, length) at the steps where they ended."""
         self.last_scores.extend(score for _, score, _ in games)
-        if self.waiting:
-            return
-        with self.reporting("the event file"), self.logging() as writer:
-            for end, score, length in games:
-                writer.add_scalar("charts/episodic_return", score, end)
-                writer.add_scalar("charts/episodic_length", length, end)
-            if self.last_scores:
-                writer.add_scalar("charts/mean_return_100", np.mean(self.last_scores), step)
-            for tag, value in scalars.items():
-                writer.add_scalar(tag, value, step)
+        mean = {"charts/mean_return_100": np.mean(self.last_scores)} if self.last_scores else {}
+        points = [(end, "charts/episodic_return", score) for end, score, _ in games]
+        points += [(end, "charts/episodic_length", length) for end, _, length in games]
+        self.append_events(points + [(step, tag, value) for tag, value in {**mean, **scalars}.items()])
+
+    def append_events(self, events: list[tuple]) -> None:
+        """Appends to the event file of this start; if that fails, a new one begins with the next events."""
+        with self.reporting("the event file"):
+            try:
+                self.event_file = self.event_file or EventFile(self.path)
+                self.event_file.append(events)
+            except OSError:
+                self.event_file = None
+                raise
 
     def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], step: int) -> None:
         """Writes games as (score, length) to `eval.csv`, and their statistics to an event file of their own.
 
         A resumed run keeps that file, which has nothing to do with how far the training had got.
         """
-        from torch.utils.tensorboard import SummaryWriter
-
+        path = os.path.join(self.path, "eval.csv")
+        rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
+        header = [] if os.path.exists(path) else [("step", "game", "score", "length")]
+        csv.writer(text := io.StringIO()).writerows([*header, *rows])
         with self.reporting("the evaluation", then=""):
-            with SummaryWriter(self.path, filename_suffix=".eval") as writer:
-                for name, value in stats.items():
-                    writer.add_scalar(f"eval/{name}", value, step)
-            with open(os.path.join(self.path, "eval.csv"), "a", newline="", encoding="utf-8") as file:
-                rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
-                csv.writer(file).writerows([("step", "game", "score", "length"), *rows] if file.tell() == 0 else rows)
+            EventFile(self.path, ".eval").append([(step, f"eval/{name}", value) for name, value in stats.items()])
+            append(path, text.getvalue().encode())
 
     def save(self, args, iteration: int, agent, optimizer) -> None:
         """Writes a checkpoint, and sets the time at which the next is due."""
@@ -374,24 +387,11 @@ class RunDirectory:
                     directory = os.open(self.path, os.O_RDONLY)
                     os.fsync(directory)
                     os.close(directory)
-                self.iteration, self.waiting = state["iteration"], False
+                self.iteration = state["iteration"]
             except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
                 with contextlib.suppress(OSError):
                     os.remove(new)
                 raise OSError(str(error)) from error
-
-    @contextlib.contextmanager
-    def logging(self) -> Iterator[Any]:
-        """Gives the event writer. If it fails, nothing more is logged until a checkpoint has been written."""
-        from torch.utils.tensorboard import SummaryWriter
-
-        try:
-            self.writer = self.writer or SummaryWriter(self.path)
-            yield self.writer
-            self.writer.flush()
-        except OSError:
-            self.writer, self.waiting = None, True  # the writer's thread is dead
-            raise
 
     @contextlib.contextmanager
     def reporting(self, what: str, then: str = "; the run goes on") -> Iterator[None]:
@@ -407,6 +407,34 @@ class RunDirectory:
         """Returns the size in bytes of each event file of the training, by name."""
         files = [file for file in os.scandir(self.path) if file.name.startswith("events.")]
         return {file.name: file.stat().st_size for file in files if not file.name.endswith(".eval")}
+
+
+class EventFile:
+    """A TensorBoard event file whose name sorts after those of all others in its directory, as readers take them.
+
+    The files of torch's SummaryWriter are named by the clock alone. If that was set back, or two machines differ, the
+    points of a resumed run would come before those that it goes on from.
+    """
+
+    def __init__(self, directory: str, suffix: str = ""):
+        before = [re.match(r"events\.out\.tfevents\.(\d{10})\.", name) for name in os.listdir(directory)]
+        second = max(int(time.time()), *(int(match[1]) + 1 for match in before if match), 0)
+        name = f"events.out.tfevents.{second:010}.{platform.node()}.{os.getpid()}.0{suffix}"
+        self.path = os.path.join(directory, name)
+
+    def append(self, events: list[tuple]) -> None:
+        """Appends (agent step, tag, value), or (agent step, summary): all of them, or none and OSError."""
+        from tensorboard.compat.proto.event_pb2 import Event
+        from tensorboard.summary.writer.record_writer import RecordWriter
+        from torch.utils.tensorboard import summary
+
+        now, writer = time.time(), RecordWriter(data := io.BytesIO())
+        if not os.path.exists(self.path):
+            writer.write(Event(wall_time=now, file_version="brain.Event:2").SerializeToString())
+        for step, *given in events:
+            shown = summary.scalar(*given) if len(given) == 2 else given[0]
+            writer.write(Event(wall_time=now, step=step, summary=shown).SerializeToString())
+        append(self.path, data.getvalue())
 
 
 # ---------------------------------------------------------------------------------------------- beside the loop
@@ -605,8 +633,6 @@ def open_run(args_class: type, description: str):
 
     Returns the arguments, the environments, the run, its checkpoint (None for a new run) and the stop signal.
     """
-    # TensorBoard's thread prints a traceback if the disk is full; RunDirectory says it in one line
-    threading.excepthook = lambda fault: issubclass(fault.exc_type, OSError) or threading.__excepthook__(fault)
     args = parse(args_class, description=description)
     stop = StopSignal()
     stop.listen()

@@ -104,7 +104,7 @@ def read_run(directory: Path) -> tuple[dict, pd.DataFrame]:
 
 
 def read_events(directory: Path) -> list[EventAccumulator]:
-    """Reads a run's event files, every point of them."""
+    """Reads a run's event files, every point of them; the order of their names is that of the run's starts."""
     files = sorted(directory.glob("events.out.tfevents*"))
     return [EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload() for file in files]
 
@@ -116,11 +116,10 @@ def read_curve(readers: list[EventAccumulator]) -> pd.DataFrame:
         logged = reader.Tags()["scalars"]
         for column, tag in TAGS.items():
             if tag in logged:
-                points += [(event.wall_time, event.step, column, event.value) for event in reader.Scalars(tag)]
+                points += [(event.step, column, event.value) for event in reader.Scalars(tag)]
         if "charts/episodic_return" in logged:
             game_ends += [event.step for event in reader.Scalars("charts/episodic_return")]
-    points.sort(key=lambda point: point[0])
-    table = pd.DataFrame(points, columns=["time", "step", "column", "value"])
+    table = pd.DataFrame(points, columns=["step", "column", "value"])
     table = table.drop_duplicates(["step", "column"], keep="last")
     table = table.pivot(index="step", columns="column", values="value").reindex(columns=list(TAGS)).sort_index()
     return table.assign(games_ended=np.searchsorted(np.sort(game_ends), table.index, side="right"))
@@ -131,7 +130,7 @@ def read_provenance(readers: list[EventAccumulator]) -> list[dict[str, str]]:
     tag, texts = "provenance/text_summary", []
     for reader in readers:
         texts += reader.Tensors(tag) if tag in reader.Tags()["tensors"] else []
-    tables = [text.tensor_proto.string_val[0].decode() for text in sorted(texts, key=lambda text: text.wall_time)]
+    tables = [text.tensor_proto.string_val[0].decode() for text in texts]
     return [dict(line.strip("|").split("|", 1) for line in table.splitlines()) for table in tables]
 
 

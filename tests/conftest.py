@@ -7,9 +7,9 @@ import resource
 import signal
 import subprocess
 import sys
-import threading
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -46,15 +46,10 @@ def each_script(request):
 
 # ---------------------------------------------------------------------------------------------- the logs of a run
 def scalars(run_dir) -> dict[str, list[tuple[int, float]]]:
-    """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points.
-
-    In the order of their writing: event files that two starts in one second make, as only tests can, have names in
-    any order.
-    """
+    """Returns what a run logged, read with TensorBoard's own reader: tag → [(step, value), …], all points."""
     reader = EventAccumulator(str(run_dir), size_guidance={"scalars": 0})
     reader.Reload()
-    events = {tag: sorted(reader.Scalars(tag), key=lambda event: event.wall_time) for tag in reader.Tags()["scalars"]}
-    return {tag: [(event.step, event.value) for event in written] for tag, written in events.items()}
+    return {tag: [(event.step, event.value) for event in reader.Scalars(tag)] for tag in reader.Tags()["scalars"]}
 
 
 def values(logged: dict, tag: str) -> np.ndarray:
@@ -116,7 +111,6 @@ def call_main(monkeypatch, capfd, tmp_path):
 
     def call(script, *flags: str) -> Ended:
         monkeypatch.setattr(sys, "argv", [script.__file__, *flags])
-        monkeypatch.setattr(threading, "excepthook", threading.excepthook)  # which main replaces
         handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         opened, status = [], 0
 
@@ -149,8 +143,9 @@ def call_main(monkeypatch, capfd, tmp_path):
 class Process(subprocess.Popen):
     """A script as a user starts it, with the tests' environments importable."""
 
-    def __init__(self, script, *flags: str, cwd: Path, file_size: int | None = None):
-        """Starts it; no file that it writes can grow beyond `file_size` bytes, as if the disk were full."""
+    def __init__(self, script, *flags: str, cwd: Path, before: Sequence[str] = (), file_size: int | None = None):
+        """Starts it by the command `before`, if any; no file that it writes can grow beyond `file_size` bytes, as if
+        the disk were full."""
 
         def prepare() -> None:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a suite in the background of a script ignores
@@ -159,7 +154,7 @@ class Process(subprocess.Popen):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
 
         super().__init__(
-            [sys.executable, script.__file__, *flags],
+            [*before, sys.executable, script.__file__, *flags],
             cwd=cwd,
             env={**os.environ, "PYTHONPATH": str(ROOT / "tests")},
             stdout=subprocess.PIPE,
@@ -187,8 +182,8 @@ def start(tmp_path):
     """Starts a script as a process in the test's own directory; with the test, the process ends."""
     started = []
 
-    def start_script(script, *flags: str, **limits) -> Process:
-        started.append(Process(script, *flags, cwd=tmp_path, **limits))
+    def start_script(script, *flags: str, **options) -> Process:
+        started.append(Process(script, *flags, cwd=tmp_path, **options))
         return started[-1]
 
     yield start_script

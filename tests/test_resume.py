@@ -5,6 +5,7 @@ import math
 import os
 import random
 import re
+import resource
 import shutil
 import signal
 import sys
@@ -17,7 +18,6 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from tbparse import SummaryReader
-from torch.utils.tensorboard import SummaryWriter
 
 import bookkeeping
 from conftest import (
@@ -350,6 +350,17 @@ def test_a_signal_that_is_ignored_at_the_start_stays_ignored(monkeypatch):
             signal.signal(number, handler)
 
 
+@pytest.mark.slow
+def test_nohup_keeps_a_run_from_the_end_of_its_terminal(script, tmp_path, start):
+    process = start(script, *flags_of(**CARTPOLE, **CANNOT_END, checkpoint_minutes=0), before=["nohup"])
+    process.wait_for(lambda: newest_step(tmp_path) > 0)
+    process.send_signal(signal.SIGHUP)
+    step = newest_step(tmp_path)
+    process.wait_for(lambda: newest_step(tmp_path) > step + 2 * ITERATION)
+    process.send_signal(signal.SIGTERM)
+    assert process.end().status == 128 + signal.SIGTERM
+
+
 @pytest.mark.parametrize("where", ["value_loss", "surrogate"])
 def test_a_number_that_is_not_finite_stops_the_run_before_it_is_saved(script, where, tmp_path, monkeypatch, call_main):
     function, calls = getattr(script, where), []
@@ -406,18 +417,49 @@ def test_a_full_disk_is_said_once_and_training_goes_on(script, too_large, tmp_pa
     assert len(steps) >= iterations - 2 and len(list(run_dir.glob("events.*"))) == 1 + (too_large == "the event file")
 
 
-def test_an_event_file_that_cannot_be_written_has_a_successor_after_the_next_checkpoint(script, tmp_path, monkeypatch):
-    """The second iteration's points are lost; a checkpoint follows each."""
-    add_scalar = SummaryWriter.add_scalar
+def test_an_event_file_that_cannot_be_written_has_a_successor(script, tmp_path, monkeypatch):
+    """The second iteration's points are lost."""
+    append, appended = bookkeeping.append, []
 
-    def add_scalar_but_one(writer, tag, value, step):
-        if (tag, step) == ("losses/kl", 2 * ITERATION):
+    def append_all_but_the_third(path, data):  # the first has the arguments
+        appended.append(path)
+        if len(appended) == 3:
             raise OSError("no space")
-        add_scalar(writer, tag, value, step)
+        append(path, data)
 
-    monkeypatch.setattr(SummaryWriter, "add_scalar", add_scalar_but_one)
-    logged = train(script, tmp_path, **CARTPOLE, total_timesteps=4 * ITERATION, checkpoint_minutes=0)
+    monkeypatch.setattr(bookkeeping, "append", append_all_but_the_third)
+    logged = train(script, tmp_path, **CARTPOLE, total_timesteps=4 * ITERATION)
     assert [step for step, _ in logged["losses/kl"]] == [ITERATION, 3 * ITERATION, 4 * ITERATION]
+    assert len(list(tmp_path.glob("events.*"))) == 2
+
+
+@pytest.mark.parametrize("before", [b"", b"four"])
+def test_what_cannot_be_appended_whole_is_not_appended(before, tmp_path):
+    path = tmp_path / "file"
+    if before:
+        bookkeeping.append(str(path), before)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (6, limits[1]))  # bytes
+    try:
+        with pytest.raises(OSError):
+            bookkeeping.append(str(path), b"8 bytes.")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (path.read_bytes() if path.exists() else b"") == before and path.exists() == bool(before)
+
+
+@pytest.mark.parametrize("hours", [-2, 0, 2])
+def test_a_resumed_runs_event_file_sorts_after_the_earlier_ones_whatever_the_clock_says(
+    script, hours, tmp_path, monkeypatch
+):
+    """Readers take event files in the order of their names. At 0 hours, two starts fall into one second."""
+    now = time.time()
+    monkeypatch.setattr(time, "time", lambda: now)
+    train(script, tmp_path, **CARTPOLE, total_timesteps=512, stop_at=256)
+    now += 3600 * hours
+    resume(script, tmp_path, **CARTPOLE, total_timesteps=512)
+    logged = scalars(tmp_path)
+    assert [step for step, _ in logged[EVERY_ITERATION]] == [128, 256, 384, 512]
     assert len(list(tmp_path.glob("events.*"))) == 2
 
 

@@ -268,7 +268,8 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
     Raises:
         ValueError: an Atari name that cannot be played under the protocol of `make_envs`.
     """
-    registered = gym.registry.get(env_id)
+    env_id = env_id.removeprefix("ale_py:")  # as elsewhere, where it has Gymnasium import ale-py
+    registered = gym.registry.get(env_id.rpartition(":")[2])
     if registered is not None and not is_atari(registered):
         return None  # Gymnasium's Blackjack-v1 is not Atari's Blackjack
     if registered is not None and registered.namespace == "ALE":

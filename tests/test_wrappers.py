@@ -155,6 +155,9 @@ def test_sticky_actions_are_played_in_the_ale_id_alone():
 
 def test_sticky_actions_belong_to_the_ale_id_alone():
     assert find_atari_game("ALE/Breakout-v5") == ("breakout", 0.25)
+    assert find_atari_game("ale_py:ALE/Breakout-v5") == ("breakout", 0.25)  # a module before it changes nothing
+    assert find_atari_game("ale_py:BreakoutNoFrameskip-v4") == ("breakout", 0.0)
+    assert find_atari_game("gymnasium:ALE/Breakout-v5") == ("breakout", 0.25)
     for name in ("Breakout", "breakout", "BreakoutNoFrameskip-v4"):
         assert find_atari_game(name) == ("breakout", 0.0)
     for name in ("NameThisGame", "name_this_game"):

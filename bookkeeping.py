@@ -131,10 +131,31 @@ def append(path: str, data: bytes) -> None:
         raise
 
 
+def kind_of_processor() -> str:
+    """Returns the newest vector instructions that torch finds here."""
+    import torch
+
+    has = torch.cpu.get_capabilities()
+    kinds = {"AMX": "amx_bf16", "AVX512-BF16": "avx512_bf16", "AVX512": "avx512_f", "AVX2": "avx2", "ARM-BF16": "bf16"}
+    return next((kind for kind, name in kinds.items() if has.get(name)), has.get("architecture", "unknown"))
+
+
+def warn_of_emulation(args) -> None:
+    """Says that `--bf16` is slow here, if it is: on a processor without instructions for it."""
+    import torch
+
+    on_gpu = args.cuda and torch.cuda.is_available()
+    if args.bf16 and not on_gpu and kind_of_processor() not in ("AMX", "AVX512-BF16", "ARM-BF16"):
+        say("--bf16: this processor has no bfloat16 instructions; expect a tenth of float32's speed")
+
+
 def tune_process() -> None:
     """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
-    # Idle OpenMP threads would spin on the cores that the games' threads need
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Idle OpenMP threads would spin on the cores that the games' threads need. For a moment they may: on processors
+    # with AMX, waking one takes longer than the network on 8 screens does.
+    if "OMP_WAIT_POLICY" not in os.environ:
+        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
+        os.environ.setdefault("GOMP_SPINCOUNT", "10000")
     # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping
     # them cuts these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
@@ -553,8 +574,9 @@ def provenance(script: str) -> dict[str, object]:
             versions[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:  # opencv-python in place of the headless one, for example
             versions[package] = "unknown"
-    machine = f"{platform.platform()}, {available_cores()} cores, {torch.backends.cpu.get_cpu_capability()}"
-    threads = f"{torch.get_num_threads()} torch, OMP_WAIT_POLICY {os.environ.get('OMP_WAIT_POLICY', 'not set')}"
+    machine = f"{platform.platform()}, {available_cores()} cores, {kind_of_processor()}"
+    waiting = (f"{name} {os.environ.get(name, 'not set')}" for name in ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT"))
+    threads = f"{torch.get_num_threads()} torch, {', '.join(waiting)}"
     versions = {"python": platform.python_version(), **versions, "script": f"sha256 {text}"}
     return {"commit": commit_of(script), **versions, "machine": machine, "threads": threads}
 
@@ -653,6 +675,7 @@ def open_run(args_class: type, description: str):
     except ValueError as error:
         refuse(flag("env_id", args.env_id), error)
     run = run or RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
+    warn_of_emulation(args)
     if args.evaluate is None:
         first, last = (state["global_step"] if state else 0), args.last_iteration * args.batch_size
         say(f"{run.path}: from step {first:,} to {last:,}")

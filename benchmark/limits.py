@@ -59,15 +59,16 @@ def probe_emulator(rom: str, num_envs: int, threads: int, seconds: float = 2.0) 
     return best
 
 
+def in_own_process(function, *arguments):
+    """Calls a function in a process of its own: thread counts hold there, and torch's memory is not this process's."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(function, *arguments).result()
+
+
 def measure_limits(
     rom: str, all_num_envs: tuple[int, ...], all_threads: tuple[int, ...]
 ) -> dict[tuple[int, int], dict]:
     """Returns the limits for each number of environments and of threads."""
-
-    def in_own_process(function, *arguments):  # in which thread counts hold
-        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            return pool.submit(function, *arguments).result()
-
     limits = {}
     for threads in all_threads:
         convolutions = [in_own_process(probe_convolutions, threads, dtype) for dtype in ("float32", "bfloat16")]

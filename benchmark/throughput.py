@@ -46,9 +46,9 @@ import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, measure_limits
+from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, in_own_process, measure_limits
 from benchmark.readme import markdown, write_part
-from bookkeeping import available_cores, parse, refuse, write_text
+from bookkeeping import available_cores, kind_of_processor, parse, refuse, write_text
 from wrappers import find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -56,7 +56,7 @@ RESULTS = ROOT / "benchmark" / "results"
 NUM_STEPS = 128  # agent steps of each environment in one iteration (appendix A): the default of every contender
 OF_PROCESS = ("time/first_iteration", "time/iteration", "time/unaccounted")  # every other `time/…` is a phase
 # A script's phases follow, by the names that it logs them under
-CSV_FIELDS = "date env_id contender commit torch cpu round job num_envs threads jobs warmup window".split()
+CSV_FIELDS = "date env_id contender commit torch cpu kind round job num_envs threads jobs warmup window".split()
 CSV_FIELDS += ["steps_per_second", "peak_mb", *LIMITS, *OF_PROCESS]
 IN_README = ("ppo_atari.py", "ppo_atari.py --bf16")  # contenders of the README's table
 
@@ -382,7 +382,8 @@ def readme_table(directory: Path = RESULTS) -> str:
                         speeds = (float(run["steps_per_second"]) for run in (of_round[name], row))
                         times[peer].append(next(speeds) / next(speeds))
             runs = [of_round[name] for of_round in shared]
-            cells = [f"{runs[0]['cpu']}, {path.stem.removeprefix('throughput_').upper()}", f"`{name}`"]
+            kind = runs[0].get("kind") or path.stem.removeprefix("throughput_").upper()  # older rows have none
+            cells = [f"{runs[0]['cpu']}, {kind}", f"`{name}`"]
             cells.append(spread([float(run["steps_per_second"]) for run in runs]))
             cells += [spread(ratios, 2) if ratios else "–" for ratios in times.values()]
             table.append([*cells, spread([float(run["peak_mb"]) for run in runs])])
@@ -409,6 +410,7 @@ def main() -> None:
     rows = [Row(contender, *setting) for setting in settings for contender in contenders]
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     cpu = (re.findall(r"model name\s*: (.*)", cpuinfo) or ["unknown processor"])[0]
+    kind = in_own_process(kind_of_processor)
 
     atari = find_atari_game(args.env_id)
     limits = measure_limits(atari[0], args.num_envs, args.threads) if atari else {}
@@ -426,14 +428,15 @@ def main() -> None:
                 date = datetime.now(timezone.utc).isoformat(timespec="seconds")
                 numbers = {**run, **limits.get((row.num_envs, row.threads), {})}
                 numbers = {column: f"{value:.6g}" for column, value in numbers.items()}
-                identity = {"contender": row.contender.name, "date": date, "cpu": cpu, "round": number, "job": job}
+                identity = {"contender": row.contender.name, "date": date, "cpu": cpu, "kind": kind}
+                identity |= {"round": number, "job": job}
                 # The row after the arguments: it has one value for those that have several
                 record = {**vars(args), **vars(row.contender), **vars(row), **identity}
                 add_rows(args.csv, [{**{name: record.get(name, "") for name in CSV_FIELDS}, **numbers}])
 
     versions = f"torch {contenders[0].torch}, commit {contenders[0].commit}"
     protocol = f"{args.rounds} rounds of {args.window} iterations after {args.warmup}; median (minimum to maximum)"
-    print(f"\n{args.env_id} on {cpu}, {available_cores()} cores, {versions}; {protocol}.\n")
+    print(f"\n{args.env_id} on {cpu}, {kind}, {available_cores()} cores, {versions}; {protocol}.\n")
     print(speed_table(rows))
     print(phase_table(rows))
     if limits:

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
+import bookkeeping
 from bookkeeping import TENSORBOARD_LAYOUT, check, command_line, commit_of, file_name
 from conftest import PATIENCE, ROOT, SHORT_CARTPOLE, SMALL, TINY_PIXELS, flags_of, run_dir_in, scalars
 
@@ -120,6 +121,17 @@ def test_the_record_of_a_run_is_strict_json(tmp_path, call_main):
         raise ValueError(constant)
 
     assert json.loads(text, parse_constant=refuse)["args"]["c"] == "inf"
+
+
+@pytest.mark.parametrize(
+    ("flags", "kind", "lines"),
+    [(["--bf16"], "AVX2", 1), (["--bf16"], "AVX512", 1), (["--bf16"], "AMX", 0), ([], "AVX2", 0)],
+)
+def test_bfloat16_that_would_be_emulated_is_warned_of_once(flags, kind, lines, monkeypatch, call_main):
+    monkeypatch.setattr(bookkeeping, "kind_of_processor", lambda: kind)
+    size = flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=128, eval_episodes=0, no_cuda="")
+    ended = call_main(acppo_atari, *(flag for flag in size if flag), *flags)
+    assert ended.status == 0 and ended.err.count("\n") == ended.err.count("has no bfloat16 instructions") == lines
 
 
 @pytest.mark.parametrize(("file", "name"), [("a/my ppo (2).py", "my-ppo--2-"), ("ppo_atari.py", "ppo_atari")])

@@ -107,6 +107,18 @@ def test_bfloat16_is_for_the_trunk_alone(script, monkeypatch):
     assert torch.allclose(agent(obs)[1], value, atol=0.02)
 
 
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
+def test_the_trunk_gets_each_brightness_rounded_once(script, dtype):
+    """As if it were divided by 255 in float32 first, and then cast: the same bits for all 256 values."""
+    agent, entered = script.Agent((4, 84, 84), 6, bf16=dtype == torch.bfloat16), []
+    agent.network[0].register_forward_pre_hook(lambda module, given: entered.append(given[0]))
+    screen = torch.arange(84 * 84, dtype=torch.uint8).reshape(1, 84, 84, 1)  # all values, many times
+    agent(screen.expand(1, 84, 84, 4))
+    expected = (screen.movedim(-1, 1).to(torch.float32) / 255).to(dtype)
+    assert entered[0].dtype == dtype and len(expected.unique()) > 200
+    assert torch.equal(entered[0], expected.expand(1, 4, 84, 84))
+
+
 def test_bfloat16_moves_a_policy_less_than_an_update_does(script):
     """The noise floor of the KL under bfloat16: the same network, its logits well apart, in both precisions."""
     torch.manual_seed(1)

@@ -8,6 +8,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from torch.utils.tensorboard import SummaryWriter
 
 import acppo_atari
+import bookkeeping
 from benchmark import limits, throughput
 from benchmark.readme import split_readme
 from benchmark.throughput import Contender, Row
@@ -136,6 +137,7 @@ def test_a_call_prints_a_row_for_each_contender_and_adds_one_for_each_process(tm
     work = ("inference", "environment", "update", "kl_pass", "first_iteration")
     assert all(float(line[f"time/{name}"]) > 0 for name in work)
     assert line["torch"].startswith("2.13.0") and line["cpu"] and line["commit"] and line["date"]
+    assert line["kind"] == bookkeeping.kind_of_processor()
 
 
 def test_rows_with_other_phases_are_added_and_those_that_are_there_stay(tmp_path):

@@ -2,6 +2,7 @@
 
     python benchmark/atari5.py                                       # the thesis's 30 runs, then its figures
     python benchmark/atari5.py --seeds 1 --stop-at 200000            # the first 4 % of ten of them
+    python benchmark/atari5.py --out ../mine --variants ppo "mine=my_ppo.py --clip-coef 0.2"  # a script of one's own
     python benchmark/atari5.py --address auto --out /shared/results  # on the nodes of a Ray cluster
 
 The same command again goes on: finished runs are skipped, others are resumed from their checkpoints. A run that fails
@@ -13,10 +14,14 @@ own directories, OUT/logs what each of them was started with and has printed. Ex
 2 bad input, 130 interrupted.
 """
 
+import contextlib
 import ctypes
 import fcntl
+import hashlib
 import importlib.util
+import io
 import itertools
+import json
 import logging
 import math
 import os
@@ -31,28 +36,35 @@ import time
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
+from types import ModuleType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import available_cores, parse, refuse, say, tell
+from bookkeeping import RETIRED, available_cores, parse, refuse, say, tell
+from bookkeeping import check as check_bounds
 
 SCRIPTS = Path(__file__).resolve().parent.parent
-# A line each: the script and its arguments, ε and c always among them, so that a checkpoint can be held against them
+# A script of this directory and its flags; a variant of one's own is given as NAME=SCRIPT FLAGS
 VARIANTS = {
-    "ppo": ("ppo_atari.py", {"clip_coef": 0.1}),  # the thesis's two, chapter 4
-    "acppo": ("acppo_atari.py", {"clip_coef": 0.16, "c": 1.0}),
+    "ppo": "ppo_atari.py --clip-coef 0.1",  # the thesis's two, chapter 4
+    "acppo": "acppo_atari.py --clip-coef 0.16 --c 1.0",
     # Is it the adaptation, or only smaller steps? Its KL is AC-PPO's on Qbert, 100 iterations (match.py --on kl)
-    "ppo-matched": ("ppo_atari.py", {"clip_coef": 0.064}),
-    "ppo-wide": ("ppo_atari.py", {"clip_coef": 0.16}),  # is it the adaptation, or the width?
-    "product": ("acppo_atari.py", {"clip_coef": 0.027, "c": math.inf}),  # the product alone; δ by match.py
-    "acppo-c0.25": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.25}),  # sensitivity to c ...
-    "acppo-c0.5": ("acppo_atari.py", {"clip_coef": 0.16, "c": 0.5}),
-    "acppo-c2": ("acppo_atari.py", {"clip_coef": 0.16, "c": 2.0}),
-    "acppo-c4": ("acppo_atari.py", {"clip_coef": 0.16, "c": 4.0}),
-    "acppo-eps0.08": ("acppo_atari.py", {"clip_coef": 0.08, "c": 1.0}),  # ... and to ε, beside PPO's
-    "acppo-eps0.32": ("acppo_atari.py", {"clip_coef": 0.32, "c": 1.0}),
-    "ppo-eps0.05": ("ppo_atari.py", {"clip_coef": 0.05}),
-    "ppo-eps0.2": ("ppo_atari.py", {"clip_coef": 0.2}),
+    "ppo-matched": "ppo_atari.py --clip-coef 0.064",
+    "ppo-wide": "ppo_atari.py --clip-coef 0.16",  # is it the adaptation, or the width?
+    "product": "acppo_atari.py --clip-coef 0.027 --c inf",  # the product alone; δ by match.py
+    "acppo-c0.25": "acppo_atari.py --clip-coef 0.16 --c 0.25",  # sensitivity to c ...
+    "acppo-c0.5": "acppo_atari.py --clip-coef 0.16 --c 0.5",
+    "acppo-c2": "acppo_atari.py --clip-coef 0.16 --c 2.0",
+    "acppo-c4": "acppo_atari.py --clip-coef 0.16 --c 4.0",
+    "acppo-eps0.08": "acppo_atari.py --clip-coef 0.08 --c 1.0",  # ... and to ε, beside PPO's
+    "acppo-eps0.32": "acppo_atari.py --clip-coef 0.32 --c 1.0",
+    "ppo-eps0.05": "ppo_atari.py --clip-coef 0.05",
+    "ppo-eps0.2": "ppo_atari.py --clip-coef 0.2",
 }
+# The grid gives these, so a variant cannot
+OF_THE_GRID = "--env-id --seed --exp-name --total-timesteps --stop-at --resume --evaluate --eval-episodes".split()
+OF_THE_GRID += "--log-dir --threads --help -h".split()
+# A run with others of these arguments is the same experiment
+NOT_COMPARED = {"threads", "log_dir", "eval_episodes", "checkpoint_minutes", "capture_video", *RETIRED}
 ATARI_5 = ("BattleZone", "DoubleDunk", "NameThisGame", "Phoenix", "Qbert")
 COMMON_FLAGS = ["--eval-episodes", "0"]  # the measure is the thesis's, the last 100 games of training
 # For the process of a dead task to end, with its iteration and its checkpoint, or a file server to notice its node's
@@ -70,7 +82,7 @@ class Args:
     seeds: tuple[int, ...] = (1, 2, 3)
     """seeds of each variant on each game; all games of one seed come before the next"""
     variants: tuple[str, ...] = ("ppo", "acppo")
-    """lines of the table VARIANTS in this file"""
+    """lines of the table VARIANTS in this file, or scripts of one's own as `"NAME=SCRIPT FLAGS"`"""
     total_timesteps: int = 5_000_000
     """agent steps of each run; Atari shows 4 frames for each, so this is the thesis's 20M frames (chapter 4)"""
     stop_at: int | None = None
@@ -84,7 +96,7 @@ class Args:
     may use. A cluster knows its own"""
     out: Path = Path(__file__).resolve().parent / "results"
     """directory for everything that comes of the grid; with `--address`, on a path that all nodes share. The default
-    is for the thesis's games and length alone"""
+    is for the thesis's games, variants and length alone"""
     address: str | None = None
     """Ray cluster to run on, host:port or `auto` (the one this machine belongs to), not the cores of this process"""
     figures: bool = True
@@ -99,12 +111,12 @@ def check(args: Args) -> None:
     for name in ("games", "seeds", "variants"):
         if not getattr(args, name):
             refuse(f"--{name}", "give at least one")
+    names = [word.partition("=")[0] for word in dict.fromkeys(args.variants)]
+    if len(names) > len(set(names)):
+        refuse(f"--variants {' '.join(args.variants)}", "give each variant a name of its own")
     for game in args.games:
         if not re.fullmatch(r"\w[\w./:-]{,100}", game):
             refuse(f"--games {game!r}", "give names such as Phoenix, apart from each other")
-    for variant in args.variants:
-        if variant not in VARIANTS:
-            refuse(f"--variants {variant}", f"give any of {', '.join(VARIANTS)}")
     if not all(0 <= seed < 2**64 for seed in args.seeds):
         refuse(f"--seeds {' '.join(map(str, args.seeds))}", "give whole numbers from 0 to 2^64 - 1")
     for name in ("total_timesteps", "stop_at", "cpus_per_run", "cores"):
@@ -119,8 +131,8 @@ def check(args: Args) -> None:
         if importlib.util.find_spec(package) is None:
             refuse(package, "is not installed; pip install -e '.[benchmark]'")
     another = not set(args.games) <= set(ATARI_5) or args.total_timesteps != Args.total_timesteps
-    if another and args.out == Args.out:
-        refuse(f"--out {args.out}", "is for the thesis's games and length; give another directory")
+    if args.out == Args.out and (another or "=" in "".join(args.variants)):
+        refuse(f"--out {args.out}", "is for the thesis's games, variants and length; give another directory")
     if args.address not in (None, "auto"):  # Ray itself would knock for minutes
         host, _, port = args.address.rpartition(":")
         try:
@@ -129,11 +141,53 @@ def check(args: Args) -> None:
             refuse(f"--address {args.address}", "no Ray cluster answers there; give host:port, or auto")
 
 
-# ------------------------------------------------------------------------------------------------------- a run
+# ------------------------------------------------------------------------------------------------- what is trained
+@dataclass
+class Variant:
+    name: str
+    script: str  # its path from the root
+    flags: list[str]
+    text: bytes  # of the script, when this call began
+    arguments: dict[str, object]  # all of the script's, as these flags set them
+
+
+def read_variant(word: str, total_timesteps: int) -> Variant:
+    """Returns a variant of `--variants`. Ends the program with status 2 if it cannot be trained."""
+    given, (name, own, command), here = f"--variants {word}", word.partition("="), Path.cwd()
+    if not own and name in VARIANTS:
+        command, here = VARIANTS[name], SCRIPTS
+    elif not own or name in VARIANTS or not re.fullmatch(r"(?!.*__)\w[\w.-]{,99}", name):
+        refuse(given, f"give any of {', '.join(VARIANTS)}, or 'ANOTHER-NAME=SCRIPT FLAGS', with no '__' in the name")
+    try:
+        script, *flags = shlex.split(command) or [""]
+        text = Path(script := os.path.abspath(here / script)).read_bytes()
+    except (ValueError, OSError) as error:
+        refuse(given, f"cannot be read ({error})")
+    for flag in flags:
+        if flag.partition("=")[0].replace("_", "-") in OF_THE_GRID:
+            refuse(given, f"leave {flag} to the grid")
+    # Imported as the text that was read, and without a trace beside it; dataclasses look it up by its name
+    module = sys.modules[f"variant {name}"] = ModuleType(f"variant {name}")
+    module.__file__ = script
+    sys.path.append(os.path.dirname(script))  # for what it imports from there
+    try:
+        with contextlib.redirect_stderr(io.StringIO()) as said:
+            exec(compile(text, script, "exec"), vars(module))
+            common = f"--total-timesteps {total_timesteps} --exp-name {name} --log-dir . --threads 1".split()
+            arguments = parse(module.Args, args=[*flags, *common, *COMMON_FLAGS])
+    except (Exception, SystemExit) as error:  # a script may raise anything
+        # tyro says why between two rules, and more around them
+        kind, said = type(error).__name__, re.sub("[│╭╮╰╯]", "", said.getvalue())
+        reason = re.split("[-─]{9,}", said)[1:2] or [f"{kind}: {error}"]
+        refuse(given, f"{script} cannot be used ({reason[0].strip()})")
+    check_bounds(arguments)
+    return Variant(name, script, flags, text, vars(arguments))
+
+
 @dataclass
 class Run:
     game: str
-    variant: str
+    variant: Variant
     seed: int
     state: str = "queued"  # then running, done or failed
     step: int = 0  # agent steps in its checkpoint when this call began
@@ -144,7 +198,7 @@ class Run:
     def name(self) -> str:
         """What its directories' names begin with; the script adds `__` and the time."""
         game = re.sub(r"[^\w.-]", "-", self.game)
-        return f"{game}__{self.variant}__{self.seed}"
+        return f"{game}__{self.variant.name}__{self.seed}"
 
     def log(self, args: Args) -> Path:
         return args.out / "logs" / f"{self.name}.log"
@@ -155,18 +209,17 @@ class Run:
 
     def command(self, args: Args) -> list[str]:
         """Returns the command that starts it, or takes it further."""
-        script, flags = VARIANTS[self.variant]
         if checkpoint := self.checkpoint(args):
-            which = {"resume": checkpoint.parent}
+            flags, which = [], {"resume": checkpoint.parent}
         else:
-            identity = {"env_id": self.game, "seed": self.seed, "exp_name": self.variant}
-            which = {**flags, **identity, "log_dir": args.out / "runs", "total_timesteps": args.total_timesteps}
+            flags, which = self.variant.flags, {"env_id": self.game, "seed": self.seed, "exp_name": self.variant.name}
+            which |= {"log_dir": args.out / "runs", "total_timesteps": args.total_timesteps}
         which["threads"] = args.cpus_per_run
         if args.stop_at is not None:
             which["stop_at"] = args.stop_at
         words = [word for name, value in which.items() for word in (f"--{name.replace('_', '-')}", str(value))]
         bf16 = ["--bf16"] if args.bf16 and not checkpoint else []
-        return [sys.executable, str(SCRIPTS / script), *words, *bf16, *COMMON_FLAGS]
+        return [sys.executable, self.variant.script, *flags, *words, *bf16, *COMMON_FLAGS]
 
     def look(self, args: Args) -> None:
         """Finds out how far it is, and whether its checkpoint is this run's: going on with another would mix two."""
@@ -182,13 +235,23 @@ class Run:
         except Exception:  # a file that is no checkpoint may make them raise anything
             self.state, self.reason = "failed", f"{checkpoint} is damaged; move its directory away"
             return
-        wanted = {"c": None, **VARIANTS[self.variant][1], "env_id": self.game, "seed": self.seed}  # PPO has no c
-        for name, value in {**wanted, "total_timesteps": args.total_timesteps}.items():
-            if (has := trained.get(name)) != value:
-                flag = f"--{name.replace('_', '-')}"
-                advice = f"not with {value}; move it away, or give another --out"
-                self.state, self.reason = "failed", f"{checkpoint.parent} is trained with {flag} {has}, {advice}"
-                return
+        wanted = {**self.variant.arguments, "env_id": self.game, "seed": self.seed}
+        # The grid's --bf16 is for new runs alone; a variant's own is part of it
+        ignored = NOT_COMPARED if wanted.get("bf16") else {*NOT_COMPARED, "bf16"}
+        differences = [
+            f"with --{name.replace('_', '-')} {trained.get(name)}, not with {wanted.get(name)}"
+            for name in {**trained, **wanted}
+            if name not in ignored and trained.get(name) != wanted.get(name)
+        ]
+        # A run of an older commit has no hash, so its arguments alone are compared
+        with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
+            record = json.loads((checkpoint.parent / "args.json").read_text(encoding="utf-8"))
+            if record["provenance"]["script"] != f"sha256 {hashlib.sha256(self.variant.text).hexdigest()}":
+                differences.append(f"by another text of {Path(self.variant.script).name}")
+        if differences:
+            advice = "move it away, or give another --out (no figures are drawn beside it)"
+            self.state, self.reason = "failed", f"{checkpoint.parent} is trained {differences[0]}; {advice}"
+            return
         if self.step >= min(args.total_timesteps // rollout * rollout, args.stop_at or math.inf):
             self.state = "done"
 
@@ -228,6 +291,8 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
                     return "another process is training it; call again when it has ended"
                 time.sleep(0.5)  # not a blocking flock: Ray's cancel could not end that
         for _ in range(2):
+            if Path(run.variant.script).read_bytes() != run.variant.text:
+                return f"{run.variant.script} has been edited since this call began; call again"
             command = run.command(args)  # now that the lock is held, and the checkpoint is whole
             log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {platform.node()}$ {shlex.join(command)}\n".encode())
             log.flush()
@@ -340,7 +405,7 @@ class Progress:
         goal = min(self.args.total_timesteps, self.args.stop_at or math.inf)
         rows, steps_left, speed = [], 0, 0
         for run in self.runs:
-            name = f"{run.game:15} {run.variant:14} seed {run.seed}"
+            name = f"{run.game:15} {run.variant.name:14} seed {run.seed}"
             if run.state == "failed":
                 rows.append(f"{name}  failed")
             if run.state not in ("queued", "running"):
@@ -365,10 +430,11 @@ def main() -> None:
     args = parse(Args, description=__doc__)
     check(args)
     args.out = args.out.resolve()  # the tasks stand elsewhere
-    # Seed by seed, variants innermost, so that pairs are complete early
-    grid = itertools.product(*map(dict.fromkeys, (args.seeds, args.games, args.variants)))  # each once
-    runs = [Run(game, variant, seed) for seed, game, variant in grid]
     try:
+        variants = [read_variant(word, args.total_timesteps) for word in dict.fromkeys(args.variants)]
+        # Seed by seed, variants innermost, so that pairs are complete early
+        grid = itertools.product(dict.fromkeys(args.seeds), dict.fromkeys(args.games), variants)  # each once
+        runs = [Run(game, variant, seed) for seed, game, variant in grid]
         try:
             for run in runs:
                 run.look(args)
@@ -382,6 +448,7 @@ def main() -> None:
                 todo = f"from step {run.step:,}: {shlex.join(run.command(args))}"
                 tell(f"{run.name}: {run.reason or ('finished' if run.state == 'done' else todo)}")
             sys.exit(any(run.state == "failed" for run in runs))
+        args.figures &= not any(run.reason for run in runs)  # what is refused would be drawn as this grid's
         if any(run.state == "queued" for run in runs):
             run_grid(runs, args)
         failed = [run for run in runs if run.state == "failed"]
@@ -390,6 +457,9 @@ def main() -> None:
         say(f"{len(runs) - len(failed)} of {len(runs)} runs are done, in {args.out}")
         if args.figures and len(failed) < len(runs):
             figures = [sys.executable, str(Path(__file__).with_name("figures.py")), "--out", str(args.out)]
+            names = [variant.name for variant in variants]
+            if len(names) > 1 and not {"ppo", "acppo"} <= {*names}:
+                figures += ["--baseline", names[0], "--challenger", names[1]]
             sys.exit(subprocess.run(figures).returncode != 0 or bool(failed))
         sys.exit(bool(failed))
     except KeyboardInterrupt:

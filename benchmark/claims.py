@@ -5,14 +5,16 @@ up to the last step that all of these have reached. `beginnings`: of each game t
 are at least half as long as its longest unfinished one, up to the last step that all of these have reached; of a
 finished run these are the first steps.
 
-How a claim is judged. A pair is a run of `ppo` and one of `acppo` with the same game and seed. Each pair has a margin
-for each claim, above 0 if it has the claim's sign:
-    score            final `mean_return_100`, acppo - ppo (across games in units of human minus random score)
-    KL               log of the ratio of the means of `losses/kl`, ppo / acppo
-    relative spikes  share of iterations with a KL above the 99th percentile of ppo's in the same game (all its seeds),
-                     ppo - acppo
-    own spikes       share of iterations with a KL above ten times the run's own median, ppo - acppo
-    clip ratio       0.02 - |mean of `losses/avg_clip_ratio` - 0.1|, so above 0 from 0.08 to 0.12; of acppo's runs alone
+How a claim is judged. The thesis's baseline is `ppo`, its challenger `acppo`; two other variants can stand in their
+places. A pair is a run of each with the same game and seed. Each pair has a margin for each claim, above 0 if it has
+the claim's sign:
+    score            final `mean_return_100`, challenger - baseline (across games in units of human minus random score)
+    KL               log of the ratio of the means of `losses/kl`, baseline / challenger
+    relative spikes  share of iterations with a KL above the 99th percentile of the baseline's in the same game (all its
+                     seeds), baseline - challenger
+    own spikes       share of iterations with a KL above ten times the run's own median, baseline - challenger
+    clip ratio       0.02 - |mean of `losses/avg_clip_ratio` - the baseline's ε|, so for PPO's 0.1 above 0 from 0.08 to
+                     0.12; of the challenger's runs alone
 On one game a claim holds if every margin is above 0, and does not hold if every margin is below 0; else the two cannot
 be told apart with these runs. Across games the same is asked of both ends of the 95 % interval of the interquartile
 mean of all margins. With fewer than three pairs, on the game or on any of the games, the two cannot be told apart at
@@ -50,16 +52,17 @@ UNDECIDED, TOO_EARLY = "cannot be told apart with these runs", "too early"
 OF_ITERATIONS = ("{:+.2%}".format, "{} of all iterations")
 # Claim → its sentence; the format of a margin across games, and the sentence around it
 CLAIMS = {
-    "score": ("AC-PPO's final score is above PPO's", "{:+.3f}".format, "{} of human minus random score"),
+    "score": ("{new}'s final score is above {base}'s", "{:+.3f}".format, "{} of human minus random score"),
     "KL": (
-        "AC-PPO's KL between policy updates is smaller",
+        "{new}'s KL between policy updates is smaller",
         lambda m: f"{math.exp(m):.2f}",
-        "PPO's mean KL is {} times AC-PPO's",
+        "{base}'s mean KL is {} times {new}'s",
     ),
-    "relative spikes": ("AC-PPO has fewer KL spikes above the 99th percentile of PPO's", *OF_ITERATIONS),
-    "own spikes": ("AC-PPO has fewer KL spikes above ten times the run's own median", *OF_ITERATIONS),
-    "clip ratio": ("AC-PPO's average clip ratio is near 0.1 (0.08 to 0.12)", "{:+.4f}".format, "{} inside the band"),
+    "relative spikes": ("{new} has fewer KL spikes above the 99th percentile of {base}'s", *OF_ITERATIONS),
+    "own spikes": ("{new} has fewer KL spikes above ten times the run's own median", *OF_ITERATIONS),
+    "clip ratio": ("{new}'s average clip ratio is near {near}", "{:+.4f}".format, "{} inside the band"),
 }
+SPELLED = {"ppo": "PPO", "acppo": "AC-PPO"}  # the others' names are as they were given
 SIGNS = {"holds": "✓", "does not hold": "✗", UNDECIDED: "?"}
 DRAWS = 10_000  # of the bootstrap
 VARIANT_ORDER = ("ppo", "acppo", "ppo-matched", "ppo-wide", "product")  # the thesis's two first; others by name
@@ -74,13 +77,25 @@ class Stage:
     runs: pd.DataFrame  # their rows of runs.csv
     drawn: Curves  # as far as the figures show them
     compared: Curves  # as the tables and claims compare them
+    baseline: str
+    challenger: str
+    epsilon: float  # the baseline's, NaN if it has none
 
     @property
     def final(self) -> bool:
         return self.name == "finished"
 
+    def words(self) -> dict[str, str]:
+        """Returns what the texts call the two variants, and what the clip ratio is to be near to."""
+        base, new = (SPELLED.get(variant, variant) for variant in (self.baseline, self.challenger))
+        band = f"{self.epsilon:g} ({self.epsilon - 0.02:g} to {self.epsilon + 0.02:g})"
+        near = (
+            band if self.epsilon == 0.1 else f"{base}'s ε, {'which no run has' if math.isnan(self.epsilon) else band}"
+        )
+        return {"base": base, "new": new, "near": near}
 
-def make_stages(runs: pd.DataFrame, curves: pd.DataFrame) -> list[Stage]:
+
+def make_stages(runs: pd.DataFrame, curves: pd.DataFrame, baseline="ppo", challenger="acppo") -> list[Stage]:
     """Returns the stages that have runs, the finished one first."""
     schedules = {tuple(key): total for *key, total in runs[[*KEY, "total_timesteps"]].itertuples(index=False)}
     everything = {key: rows.set_index("step").drop(columns=KEY) for key, rows in curves.groupby(KEY)}
@@ -102,7 +117,8 @@ def make_stages(runs: pd.DataFrame, curves: pd.DataFrame) -> list[Stage]:
         together = in_order({key: curve for of_game in drawn for key, curve in of_game.items()})
         if together:
             rows = runs.set_index(KEY).loc[list(together)].reset_index()
-            stages.append(Stage(name, rows, together, in_order(cut)))
+            epsilon = epsilons(runs).get(baseline, math.nan)
+            stages.append(Stage(name, rows, together, in_order(cut), baseline, challenger, epsilon))
     return stages
 
 
@@ -125,16 +141,17 @@ def seeds(curves: Curves, variant: str, game: str) -> dict[int, pd.DataFrame]:
     return {key[2]: curve for key, curve in curves.items() if key[:2] == (variant, game)}
 
 
-def pairs(curves: Curves, game: str) -> list[tuple[pd.DataFrame, pd.DataFrame]]:
-    """Returns the curves of ppo and acppo, seed by seed."""
-    ppos, acppos = seeds(curves, "ppo", game), seeds(curves, "acppo", game)
-    return [(ppos[seed], acppos[seed]) for seed in sorted(ppos.keys() & acppos.keys())]
+def pairs(stage: Stage, game: str) -> list[tuple[pd.DataFrame, pd.DataFrame]]:
+    """Returns the curves of baseline and challenger, seed by seed."""
+    base, new = (seeds(stage.compared, variant, game) for variant in (stage.baseline, stage.challenger))
+    return [(base[seed], new[seed]) for seed in sorted(base.keys() & new.keys())]
 
 
 def epsilons(runs: pd.DataFrame) -> dict[str, float]:
-    """Returns each variant's ε, its widest clip range; with c = inf the range has no bound, and it has none here."""
+    """Returns each variant's ε, its widest clip range, if it has one; with c = inf the range has no bound."""
     arguments = {run.variant: json.loads(run.arguments) for run in runs.itertuples()}
-    return {name: args["clip_coef"] for name, args in arguments.items() if math.isfinite(float(args.get("c", 0)))}
+    bounded = {name: args for name, args in arguments.items() if str(args.get("c")) != "inf"}
+    return {name: args["clip_coef"] for name, args in bounded.items() if "clip_coef" in args}
 
 
 # -------------------------------------------------------------------------------------------------- statistics
@@ -170,9 +187,9 @@ def bootstrap_interval(strata: list[np.ndarray]) -> tuple[float, float] | None:
     return float(low), float(high)
 
 
-def spike_limit(curves: Curves, game: str) -> float:
-    """Returns the 99th percentile of the KL of all of ppo's runs, NaN if there are none."""
-    kl = [curve.kl for curve in seeds(curves, "ppo", game).values()]
+def spike_limit(stage: Stage, game: str) -> float:
+    """Returns the 99th percentile of the KL of all of the baseline's runs, NaN if there are none."""
+    kl = [curve.kl for curve in seeds(stage.compared, stage.baseline, game).values()]
     return float(np.quantile(pd.concat(kl), 0.99)) if kl else math.nan
 
 
@@ -184,18 +201,18 @@ def share_of_own_spikes(kl: pd.Series) -> float:
     return share_above(kl, 10 * kl.median())
 
 
-def find_margins(curves: Curves) -> dict[str, dict[str, np.ndarray]]:
+def find_margins(stage: Stage) -> dict[str, dict[str, np.ndarray]]:
     """Returns claim → game → (pairs,) by the rule that opens this file, without pairs in which no game has ended."""
     margins = {claim: {} for claim in CLAIMS}
-    for game in games(curves):
-        both, limit = pairs(curves, game), spike_limit(curves, game)
-        acppos = seeds(curves, "acppo", game).values()
+    for game in games(stage.compared):
+        both, limit = pairs(stage, game), spike_limit(stage, game)
+        of_new = seeds(stage.compared, stage.challenger, game).values()
         of_game = {
-            "score": [acppo.mean_return_100.iloc[-1] - ppo.mean_return_100.iloc[-1] for ppo, acppo in both],
-            "KL": [np.log(ppo.kl.mean()) - np.log(acppo.kl.mean()) for ppo, acppo in both],
-            "relative spikes": [share_above(ppo.kl, limit) - share_above(acppo.kl, limit) for ppo, acppo in both],
-            "own spikes": [share_of_own_spikes(ppo.kl) - share_of_own_spikes(acppo.kl) for ppo, acppo in both],
-            "clip ratio": [0.02 - abs(acppo.avg_clip_ratio.mean() - 0.1) for acppo in acppos],
+            "score": [new.mean_return_100.iloc[-1] - base.mean_return_100.iloc[-1] for base, new in both],
+            "KL": [np.log(base.kl.mean()) - np.log(new.kl.mean()) for base, new in both],
+            "relative spikes": [share_above(base.kl, limit) - share_above(new.kl, limit) for base, new in both],
+            "own spikes": [share_of_own_spikes(base.kl) - share_of_own_spikes(new.kl) for base, new in both],
+            "clip ratio": [0.02 - abs(new.avg_clip_ratio.mean() - stage.epsilon) for new in of_new],
         }
         for claim, values in of_game.items():
             margins[claim][game] = np.array([value for value in values if math.isfinite(value)])
@@ -242,9 +259,10 @@ def last_step(curves: Curves, game: str) -> str:
 
 
 def score_table(curves: Curves) -> str:
-    """Our scores beside published ones."""
+    """Our scores beside those of random and human play, and in a table of their own the published ones of trainings."""
     scores = read_scores(games(curves))
-    published = {key: rows.set_index("game") for key, rows in scores.groupby(["agent_steps", "source"], sort=False)}
+    beside, published = scores[scores.agent_steps == 0], scores[scores.agent_steps > 0]
+    beside = {source: rows.set_index("game") for source, rows in beside.groupby("source", sort=False)}
     table = []
     for game in games(curves):
         row = [game, last_step(curves, game)]
@@ -255,12 +273,9 @@ def score_table(curves: Curves) -> str:
                 row.append(f"{over_seeds(final)} (n = {len(final)}{of_games})")
             else:
                 row.append("–")
-        for lines in published.values():
-            given = game in lines.index
-            row.append(plus_minus(*lines.loc[game, ["score_mean", "score_std"]]) if given else "–")
+        for lines in beside.values():
+            row.append(plus_minus(*lines.loc[game, ["score_mean", "score_std"]]) if game in lines.index else "–")
         table.append(row)
-    headings = [source + (f", {steps:,}" if steps else "") for steps, source in published]
-    notes = dict.fromkeys(f"{row.source}: {row.note}" for row in scores[scores.note.ne("")].itertuples())
     text = (
         "Mean score of the last 100 games at the agent step given (on Atari 4 frames each): mean ± sample standard"
         " deviation (ddof 1) over n seeds."
@@ -270,9 +285,15 @@ def score_table(curves: Curves) -> str:
             " If a seed had ended fewer than 100 games, the fewest are given, and its mean is over all since the start,"
             " without the long ones that had not ended."
         )
-    if published:
-        text += f" Published scores stand under their source and its agent steps ({'; '.join(notes)})."
-    return markdown(["game", "agent steps", *variants(curves), *headings], table) + f"\n{text}\n"
+    text = markdown(["game", "agent steps", *variants(curves), *beside], table) + f"\n{text}\n"
+    others = [
+        [row.game, row.source, f"{row.agent_steps:,}", plus_minus(row.score_mean, row.score_std), row.note]
+        for row in published.sort_values("game", kind="stable").itertuples()
+    ]
+    if others:
+        text += "\n" + markdown(["game", "published", "agent steps", "score", "note"], others)
+        text += "\nPublished scores, each after the agent steps of its row; they are no measure for another length.\n"
+    return text
 
 
 def evaluation_table(runs: pd.DataFrame) -> str:
@@ -291,15 +312,16 @@ def mean_and_interval(strata: list[np.ndarray], number=lambda value: f"{value:.3
     return number(interquartile_mean(np.concatenate(strata))), text
 
 
-def human_table(curves: Curves) -> str:
+def human_table(stage: Stage) -> str:
     """Interquartile means of human-normalised final scores, nothing if no game has a human score."""
+    curves = stage.compared
     ranges = human_ranges(games(curves))
     strata = {}
     for variant in variants(curves):
         finals = [(last_scores(seeds(curves, variant, game)) - low) / height for game, (low, height) in ranges.items()]
         strata[variant] = [final for final in finals if len(final)]
-    differences = in_human_ranges(find_margins(curves)["score"]).values()
-    strata["acppo − ppo, by pairs"] = [values for values in differences if len(values)]
+    differences = in_human_ranges(find_margins(stage)["score"]).values()
+    strata[f"{stage.challenger} − {stage.baseline}, by pairs"] = [values for values in differences if len(values)]
     table = []
     for name, finals in strata.items():
         if finals:
@@ -313,33 +335,33 @@ def human_table(curves: Curves) -> str:
     )
 
 
-def kl_table(runs: pd.DataFrame, curves: Curves) -> str:
+def kl_table(stage: Stage) -> str:
     """How far an update moves the policy, over all iterations of all seeds."""
-    table = []
+    table, curves = [], stage.compared
     for game, variant in itertools.product(games(curves), variants(curves)):
         if not (of_seeds := list(seeds(curves, variant, game).values())):
             continue
         together = pd.concat(of_seeds)
         numbers = (together.kl.mean(), together.kl.median(), together.kl.quantile(0.99), together.kl.max())
         shares = (
-            share_above(together.kl, spike_limit(curves, game)),
+            share_above(together.kl, spike_limit(stage, game)),
             np.mean([share_of_own_spikes(curve.kl) for curve in of_seeds]),
-            share_above(together.max_tv_distance, epsilons(runs).get(variant, math.nan) / 2),
+            share_above(together.max_tv_distance, epsilons(stage.runs).get(variant, math.nan) / 2),
         )
         row = [game, variant, str(len(of_seeds)), last_step(curves, game)]
         row += [f"{number:.3g}" for number in numbers]
         row += [f"{share:.2%}" if math.isfinite(share) else "–" for share in shares]
         table.append([*row, f"{together.avg_clip_ratio.mean():.4f}"])
     columns = ["game", "variant", "seeds", "agent steps", "mean KL", "median", "99th percentile", "maximum"]
-    columns += ["spikes: above ppo's 99th percentile", "spikes: above 10 × own median"]
+    columns += [f"spikes: above {stage.baseline}'s 99th percentile", "spikes: above 10 × own median"]
     columns += ["largest TV distance above ε / 2", "average clip ratio"]
     return markdown(columns, table)
 
 
 def claims_table(stage: Stage) -> str:
     """A line for each claim of the thesis, judged by the rule in this file's docstring."""
-    table = []
-    for claim, margins in find_margins(stage.compared).items():
+    table, words = [], stage.words()
+    for claim, margins in find_margins(stage).items():
         said, number, sentence = CLAIMS[claim]
         strata = list((in_human_ranges(margins) if claim == "score" else margins).values())
         if claim == "score" and not stage.final:
@@ -349,8 +371,8 @@ def claims_table(stage: Stage) -> str:
             if len(strata) > 1 and any(map(len, strata)):
                 judged = verdict(min(map(len, strata)), *(bootstrap_interval(strata) or (-math.inf, math.inf)))
                 mean, interval = mean_and_interval(strata, number)
-                cells[-1] = f"{SIGNS[judged]} {judged}: {sentence.format(mean)} ({interval})"
-        table.append([said, *cells])
+                cells[-1] = f"{SIGNS[judged]} {judged}: {sentence.format(mean, **words)} ({interval})"
+        table.append([said.format(**words), *cells])
     return markdown(["claim", *games(stage.compared), "across games"], table)
 
 
@@ -390,14 +412,15 @@ def short_table(stages: list[Stage]) -> str:
     """The project README's table: of each game, the pairs of its most advanced stage."""
     table = []
     for game in sorted(set().union(*(games(stage.compared) for stage in stages))):
-        stage = next((stage for stage in stages if pairs(stage.compared, game)), None)
+        stage = next((stage for stage in stages if pairs(stage, game)), None)
         if stage is None:
             continue
-        both, margins = pairs(stage.compared, game), find_margins(stage.compared)
+        both, margins = pairs(stage, game), find_margins(stage)
         finals = [last_scores(dict(enumerate(of_variant))) for of_variant in zip(*both)]
         row = [game, str(len(both)), last_step(stage.compared, game)]
         row += [over_seeds(final) if len(final) else "–" for final in finals]
         row.append(f"{math.exp(margins['KL'][game].mean()):.2f}")
         judged = judge(margins["score"][game]).replace(SIGNS[UNDECIDED], "undecided:") + " pairs"
         table.append([*row, judged if stage.final else TOO_EARLY])
-    return markdown(["game", "n", "steps", "PPO", "AC-PPO", "PPO's KL ÷ AC-PPO's", "AC-PPO scores more"], table)
+    base, new = stages[0].words()["base"], stages[0].words()["new"]
+    return markdown(["game", "n", "steps", base, new, f"{base}'s KL ÷ {new}'s", f"{new} scores more"], table)

@@ -1,12 +1,12 @@
 """The thesis's figures and tables, and the verdicts on its claims, from the grid's event files.
 
     python benchmark/figures.py
-    python benchmark/figures.py --out ../another-grid
+    python benchmark/figures.py --out ../another-grid --baseline ppo --challenger mine
 
 `collect.py` brings OUT/runs.csv and OUT/curves.csv up to date, and everything else is made from these two alone:
 OUT/figures/STAGE/*.png and *.svg, and in OUT/README.md, between `<!-- results -->` and `<!-- end results -->`, the
-tables and verdicts of `claims.py`. The default grid's short table goes between the same two marks of the project's
-README. What stands outside the marks stays.
+tables and verdicts of `claims.py`, on two variants and with others beside them. The default grid's short table of the
+thesis's two goes between the same two marks of the project's README. What stands outside the marks stays.
 
 A stage is `finished` or `beginnings`. Each game of `finished` shows its finished runs as far as they got; each game of
 `beginnings` all its runs, as far as the longest unfinished one.
@@ -16,8 +16,10 @@ import itertools
 import json
 import math
 import os
+import re
 import sys
 import textwrap
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -75,7 +77,6 @@ FIGURES = {
         {"max_ratio_advantage": "max |(ρ − 1)Â|"},
     ),
 }
-PPO_EPSILON = 0.1  # appendix A
 # Okabe and Ito's colours, which colour-blind readers can tell apart
 COLOURS = {"ppo": "#0072B2", "acppo": "#D55E00", "ppo-matched": "#E69F00", "ppo-wide": "#56B4E9", "product": "#009E73"}
 SPARE_COLOURS = ("#CC79A7", "#F0E442", "#000000")  # of other variants, by name; then again with other dashes
@@ -87,6 +88,10 @@ LONG = 1000  # iterations; longer runs get smooth lines and pixels for the rest
 class Args:
     out: Path = DEFAULT_OUT
     """directory of the grid: its runs are in OUT/runs, and everything made of them is written beside that"""
+    baseline: str = "ppo"
+    """variant that the other one is held against, by its seeds, its ε and its KL's 99th percentile"""
+    challenger: str = "acppo"
+    """variant that the verdicts are on"""
 
 
 def frames_per_step(game: str) -> int:
@@ -113,17 +118,18 @@ def captions(stage: Stage) -> dict[str, str]:
     spikes = "Thin: every iteration of each seed. Thick: running median over a twentieth of them, then over a "
     spikes += "variant's seeds, as far as all have got."
     kl = pd.concat([curve.kl for curve in curves.values()]).median()
-    args = json.loads(runs.arguments.iloc[0])
-    samples = args["num_envs"] * args["num_steps"]
-    noise = f"√(2 KL / {samples:,}), {math.sqrt(2 * kl / samples):.1g} at the median KL {kl:.1g}"
+    samples = sorted({args["num_envs"] * args["num_steps"] for args in map(json.loads, runs.arguments)})
+    noise = f"√(2 KL / {samples[0]:,}), {math.sqrt(2 * kl / samples[0]):.1g} at the median KL {kl:.1g}"
     bounds = ", ".join(f"{epsilon / 2:g} for {variant}" for variant, epsilon in epsilons(runs).items())
-    estimator = f"the thesis's estimator, the mean of log π − log π_new over the {samples:,} actions taken"
+    taken = " or ".join(f"{number:,}" for number in samples)
+    estimator = f"the thesis's estimator, the mean of log π − log π_new over the {taken} actions taken"
     bound = "which bounds the maximum while every ratio is inside its range (proposition 2.4.1)"
+    dashed = f" Dashed: {stage.words()['base']}'s ε = {stage.epsilon:g}." if math.isfinite(stage.epsilon) else ""
     texts = {
         "score": band,
         "kl": "Top: exact over actions, mean over the rollout's states. "
         f"Bottom: {estimator}; its noise is about {noise}, so it can be negative. {spikes}",
-        "avg_clip_ratio": f"Clip range, mean over an iteration's samples. Dashed: PPO's ε = {PPO_EPSILON}. {spikes}",
+        "avg_clip_ratio": f"Clip range, mean over an iteration's samples.{dashed} {spikes}",
         "tv_distance": "Top: mean over the rollout's states. Bottom: its maximum over them. "
         f"Dashed, in the variant's colour: ε / 2 ({bounds}), {bound}. {spikes}",
         "ratio_advantage": f"Theorem 3.1.1's δ on the rollout's samples; Â normalised over the rollout. {spikes}",
@@ -150,7 +156,7 @@ def draw_figure(name: str, stage: Stage) -> Figure:
             title_n = "\n(n = " + ", ".join(f"{n} {variant}" for variant, n in counts.items()) + ")"
         axis.set_title(game + title_n, fontsize="small")
         draw_panel(axis, curves, game, column)
-        lines = {"ppo": PPO_EPSILON} if name == "avg_clip_ratio" else {}
+        lines = {stage.baseline: stage.epsilon} if name == "avg_clip_ratio" and math.isfinite(stage.epsilon) else {}
         if name == "tv_distance":
             lines = {variant: epsilon / 2 for variant, epsilon in epsilons(stage.runs).items() if variant in counts}
         for variant, value in lines.items():
@@ -210,12 +216,14 @@ def draw(out: Path, stages: list[Stage]) -> None:
 
 
 # ------------------------------------------------------------------------------------------------- OUT/README.md
-READ = f"""KL is that between policy updates (`losses/kl`, nats, exact over actions), of every iteration up to the
-step given; shares are of iterations, and ppo's above its own 99th percentile is about 1 % by definition. The largest
+def how_to_read(stage: Stage) -> str:
+    old, new = stage.baseline, stage.challenger
+    return f"""KL is that between policy updates (`losses/kl`, nats, exact over actions), of every iteration up to the
+step given; shares are of iterations, and {old}'s above its own 99th percentile is about 1 % by definition. The largest
 TV distance is over the visited states; ε / 2 bounds it only while every ratio is inside its range (proposition 2.4.1).
 
 The thesis's claims: ✓ holds, ✗ does not hold, ? {UNDECIDED}. A game is judged by its
-pairs of ppo and acppo with the same seed (the clip ratio by runs of acppo): {FEWEST_PAIRS} or more must be there, and
+pairs of {old} and {new} with the same seed (the clip ratio by runs of {new}): {FEWEST_PAIRS} or more must be there, and
 all must agree; the table counts those with the claim's sign. Across games, the 95 % interval of the margins'
 interquartile mean must exclude "no difference"; with three seeds a game it does so for two equal algorithms one time
 in ten, not in twenty. A final score is judged only by runs that have done {100 * FINISHED:.0f} % of their schedule.
@@ -252,22 +260,26 @@ def coverage(stage: Stage) -> str:
     left_out = [f"{key[1]} {key[0]} {key[2]}" for key in stage.drawn if key not in stage.compared]
     if left_out:
         text += f" In the figures alone, being shorter than half of their game's longest: {', '.join(left_out)}."
+    texts = {(run.variant, text) for run in runs.itertuples() for text in re.findall(r"sha256 \w+", run.versions)}
+    counts = Counter(variant for variant, _ in texts)
+    if several := sorted(variant for variant, count in counts.items() if count > 1):
+        text += f" Trained by more than one text of the script: {', '.join(several)}."
     return f"{text} {bf16_note(runs)} Commits {', '.join(commits)}; {'; '.join(machines)}.\n"
 
 
 def stage_tables(stage: Stage) -> dict[str, str]:
     """Returns the tables by the name of the figure that they stand under."""
     scores = [score_table(stage.compared)]
-    judged = [kl_table(stage.runs, stage.compared), claims_table(stage)]
+    judged = [kl_table(stage), claims_table(stage)]
     if stage.final:
-        scores += [evaluation_table(stage.runs), human_table(stage.compared)]
+        scores += [evaluation_table(stage.runs), human_table(stage)]
         judged += [progress_table(stage.compared), spikes_table(stage.compared)]
     return {"score": "\n".join(filter(None, scores)), "kl": "\n".join(judged)}
 
 
 def results_part(stages: list[Stage]) -> str:
     """Returns the generated part of OUT/README.md."""
-    parts = [READ]
+    parts = [how_to_read(stages[0])]
     for stage in stages:
         parts += [f"## {'Finished runs' if stage.final else 'Beginnings'}\n", coverage(stage)]
         for name, tables in stage_tables(stage).items():
@@ -280,12 +292,20 @@ def results_part(stages: list[Stage]) -> str:
 def main() -> None:
     args = parse(Args, description=__doc__)
     try:
-        stages = make_stages(*read_grid(args.out))
+        runs, curves = read_grid(args.out)
+        known = sorted(runs.variant.unique())
+        for name in ("baseline", "challenger"):
+            # A grid without ppo or acppo has its figures, too
+            if (variant := getattr(args, name)) not in (*known, getattr(Args, name)):
+                refuse(f"--{name} {variant}", f"no run is of this variant; give one of {', '.join(known)}")
+        if args.baseline == args.challenger:
+            refuse(f"--challenger {args.challenger}", "is the baseline, too; give another")
+        stages = make_stages(runs, curves, args.baseline, args.challenger)
         readme = args.out / "README.md"
         if not readme.exists():
             write_text(readme, "# Results\n\n<!-- results -->\n<!-- end results -->\n")
         written = [(readme, results_part(stages))]
-        if args.out.resolve() == DEFAULT_OUT:
+        if args.out.resolve() == DEFAULT_OUT and (args.baseline, args.challenger) == (Args.baseline, Args.challenger):
             written.append((ROOT / "README.md", short_table(stages)))
         for readme, _ in written:
             if split_readme(readme, "results") is None:

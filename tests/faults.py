@@ -228,12 +228,12 @@ the grid goes on with the older of two directories | benchmark/atari5.py | test_
 +return min((args.out / "runs").glob(
 
 the grid goes on with a run of other arguments | benchmark/atari5.py | test_atari5.py -k another_run
--if (has := trained.get(name)) != value:
-+if (has := trained.get(name, value)) is None:
+-if name not in ignored and trained.get(name) != wanted.get(name)
++if name not in ignored and trained.get(name, wanted.get(name)) is None
 
 runs of two seeds make a pair | benchmark/claims.py | test_figures.py -k pair_has
--[(ppos[seed], acppos[seed]) for seed in sorted(ppos.keys() & acppos.keys())]
-+list(zip(ppos.values(), acppos.values()))
+-[(base[seed], new[seed]) for seed in sorted(base.keys() & new.keys())]
++list(zip(base.values(), new.values()))
 
 one script alone is changed | ppo_atari.py | test_siblings.py
 -if epoch_kl > args.target_kl:

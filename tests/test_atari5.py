@@ -1,8 +1,11 @@
 """The grid on real Ray: one command that is interrupted, called again, fails in part, and loses a worker and a node."""
 
 import fcntl
+import json
 import os
 import re
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,9 +16,10 @@ from pathlib import Path
 import pytest
 import torch
 
+import bookkeeping
 from benchmark import atari5
-from benchmark.atari5 import Args, Progress, Run
-from conftest import ROOT, scalars
+from benchmark.atari5 import Args, Progress
+from conftest import ROOT, SCRIPTS, scalars
 
 ENDLESS = 10**9  # agent steps: no run ends before its test lets it
 GUARD = 300  # seconds, after which something hangs; no outcome depends on it
@@ -25,6 +29,10 @@ GRID = ["--seeds", "1", "--total-timesteps", str(ENDLESS), "--no-figures"]
 def grid_command(out: Path, *flags: str) -> list[str]:
     cores = [] if "--address" in flags else ["--cores", "2"]  # two runs at once, however many there are
     return [sys.executable, str(ROOT / "benchmark" / "atari5.py"), *GRID, "--out", str(out), *cores, *flags]
+
+
+def make_run(game: str, variant: str, total_timesteps: int = 5_000_000) -> atari5.Run:
+    return atari5.Run(game, atari5.read_variant(variant, total_timesteps), seed=1)
 
 
 STARTED = []
@@ -213,7 +221,7 @@ def test_with_figures_it_ends_in_those_of_its_runs_whatever_the_locale_and_matpl
 
 def test_a_run_that_another_call_is_training_is_left_to_it(tmp_path, monkeypatch):
     monkeypatch.setattr(atari5, "LOCK_SECONDS", 0)
-    run, args = Run("CartPole-v1", "ppo", 1), Args(out=tmp_path)
+    run, args = make_run("CartPole-v1", "ppo"), Args(out=tmp_path)
     (tmp_path / "logs").mkdir()
     with run.log(args).open("ab") as log:
         fcntl.flock(log, fcntl.LOCK_EX)
@@ -229,7 +237,7 @@ def test_a_checkpoint_of_other_arguments_is_reported_and_not_gone_on_with(grid, 
     for variant, difference in (("ppo", "--clip-coef 0.1, not with 0.16"), ("acppo", "--c 1.0, not with None")):
         run_dir = run_dirs(out)[f"CartPole-v1__{variant}__1"]
         renamed = run_dir.rename(run_dir.with_name(run_dir.name.replace(variant, "ppo-wide")))
-        wide = Run("CartPole-v1", "ppo-wide", 1)
+        wide = make_run("CartPole-v1", "ppo-wide", ENDLESS)
         wide.look(Args(out=out, total_timesteps=ENDLESS))
         renamed.rename(run_dir)
         assert wide.state == "failed" and difference in wide.reason
@@ -257,7 +265,7 @@ def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path, c
 
 
 def test_a_run_goes_on_with_the_arithmetic_that_it_began_with(tmp_path):
-    run, args = Run("Qbert", "ppo", 1), Args(out=tmp_path, bf16=True)
+    run, args = make_run("Qbert", "ppo"), Args(out=tmp_path, bf16=True)
     assert "--bf16" in run.command(args) and "--bf16" not in run.command(Args(out=tmp_path))
     (tmp_path / "runs" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
     (tmp_path / "runs" / "Qbert__ppo__1__1700000000" / "checkpoint.pt").touch()
@@ -291,11 +299,17 @@ def test_what_cannot_work_is_refused_in_one_line(flags, call):
 
 
 @pytest.mark.parametrize(
-    "flags", [["--games", "Qbert", "Pong"], ["--total-timesteps", "20480"], ["--games", "Pong-v5"]]
+    "flags",
+    [
+        ["--games", "Qbert", "Pong"],
+        ["--total-timesteps", "20480"],
+        ["--games", "Pong-v5"],
+        ["--variants", "ppo", f"mine={ROOT / 'ppo_atari.py'}"],
+    ],
 )
 def test_another_grid_than_the_thesis_s_takes_a_directory_of_its_own(flags, call):
     status, _, said = call(*flags)
-    assert status == 2 and said.startswith("--out ") and "the thesis's games and length" in said
+    assert status == 2 and said.startswith("--out ") and "the thesis's games, variants and length" in said
 
 
 def test_a_missing_package_is_named_before_anything_runs(call, monkeypatch):
@@ -320,14 +334,14 @@ def test_a_grid_takes_the_cores_that_it_is_given(tmp_path, call, monkeypatch):
 
 def test_an_interrupted_directory_without_a_checkpoint_does_not_count(tmp_path):
     (tmp_path / "runs" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
-    run = Run("Qbert", "ppo", 1)
+    run = make_run("Qbert", "ppo")
     run.look(Args(out=tmp_path))
     assert run.state == "queued" and "--resume" not in run.command(Args(out=tmp_path))
 
 
 def test_the_table_shows_percent_score_and_time_left_from_the_logs(tmp_path):
     args = Args(out=tmp_path, total_timesteps=10_000_000, stop_at=1_000_000)
-    runs = [Run(game, "ppo", 1) for game in ("Phoenix", "Qbert", "Pong")]
+    runs = [make_run(game, "ppo") for game in ("Phoenix", "Qbert", "Pong")]
     runs[2].state = "failed"
     (tmp_path / "logs").mkdir()
     runs[0].log(args).write_text(
@@ -409,13 +423,19 @@ def test_a_killed_node_costs_time_and_nothing_else(tmp_path):
 
 
 # ---------------------------------------------------------------------------------------- a run's own checkpoints
-def look_at(out: Path, step: int, **trained) -> Run:
-    """Returns a run of ppo that has looked at a checkpoint of this step, trained with its arguments or others."""
-    args = {"clip_coef": 0.1, "env_id": "Qbert", "seed": 1, "total_timesteps": 10_000, "num_envs": 8, "num_steps": 128}
-    directory = out / "runs" / "Qbert__ppo__1__1700000000"
+def look_at(out: Path, step: int, variant: str = "ppo", script_then: str | None = None, **trained) -> atari5.Run:
+    """Returns a run of Qbert that has looked at a checkpoint of this step, trained with its arguments or others.
+
+    `script_then` is what `args.json` has as its script's text; by default it has none, as of an older commit.
+    """
+    run = make_run("Qbert", variant, total_timesteps=10_000)
+    of_run = {"env_id": "Qbert", "seed": 1, "exp_name": run.variant.name, "total_timesteps": 10_000}
+    args = bookkeeping.saved_args(SCRIPTS.get(variant, SCRIPTS["ppo"]).Args(**of_run))
+    directory = out / "runs" / f"{run.name}__1700000000"
     directory.mkdir(parents=True, exist_ok=True)
     torch.save({"args": {**args, **trained}, "global_step": step}, directory / "checkpoint.pt")
-    run = Run("Qbert", "ppo", 1)
+    provenance = {} if script_then is None else {"script": script_then}
+    (directory / "args.json").write_text(json.dumps({"provenance": provenance}))
     run.look(Args(out=out, total_timesteps=10_000))
     return run
 
@@ -431,6 +451,8 @@ def test_a_run_is_finished_at_the_last_whole_rollout_of_its_steps(tmp_path):
         ({"c": 1.0}, "--c 1.0, not with None"),
         ({"env_id": "Pong"}, "--env-id Pong, not with Qbert"),
         ({"seed": 2}, "--seed 2, not with 1"),
+        ({"exp_name": "acppo"}, "--exp-name acppo, not with ppo"),
+        ({"gamma": 0.9}, "--gamma 0.9, not with 0.99"),
         ({"total_timesteps": 20_000}, "--total-timesteps 20000, not with 10000"),
     ],
 )
@@ -444,4 +466,156 @@ def test_of_two_directories_of_a_run_the_newer_is_gone_on_with(tmp_path):
     older = tmp_path / "runs" / "Qbert__ppo__1__1700000000"
     newer = older.rename(older.with_name("Qbert__ppo__1__1700000100"))
     look_at(tmp_path, 2048)
-    assert Run("Qbert", "ppo", 1).checkpoint(Args(out=tmp_path)) == newer / "checkpoint.pt"
+    assert make_run("Qbert", "ppo").checkpoint(Args(out=tmp_path)) == newer / "checkpoint.pt"
+
+
+# ------------------------------------------------------------------------------------------- a variant of one's own
+@pytest.fixture
+def my_ppo(tmp_path, monkeypatch) -> Path:
+    """A script in the current directory."""
+    monkeypatch.chdir(tmp_path)
+    return Path(shutil.copy(ROOT / "ppo_atari.py", tmp_path / "my_ppo.py"))
+
+
+@pytest.mark.parametrize(
+    ("variants", "said"),
+    [
+        (["mine=nowhere.py"], "--variants mine=nowhere.py: cannot be read"),
+        (["mine="], "--variants mine=: cannot be read"),
+        (["mine=my_ppo.py --exp 'x"], "cannot be read (No closing quotation)"),
+        (["mine=my_ppo.py --clip-coeff 0.2"], "cannot be used (Unrecognized options: --clip-coeff"),
+        (["mine=my_ppo.py --clip-coef"], "cannot be used (Missing value for argument '--clip-coef'"),
+        (["mine=my_ppo.py --clip-coef x"], "cannot be used (Error parsing --clip-coef: "),
+        (["mine=my_ppo.py --clip-coef -1"], "--clip-coef -1.0: give a number above 0"),
+        (["mine=my_ppo.py --num-minibatches 3"], "--num-minibatches 3: give a divisor"),
+        (["mine=my_ppo.py --seed 2"], "leave --seed to the grid"),
+        (["mine=my_ppo.py --env_id=Pong"], "leave --env_id=Pong to the grid"),
+        (["mine=my_ppo.py -h"], "leave -h to the grid"),
+        (["my__ppo=my_ppo.py"], "no '__' in the name"),
+        (["../mine=my_ppo.py"], "ANOTHER-NAME"),
+        (["=my_ppo.py"], "ANOTHER-NAME"),
+        (["ppo=my_ppo.py"], "ANOTHER-NAME"),
+        (["mine=my_ppo.py", "mine=my_ppo.py --clip-coef 0.2"], "give each variant a name of its own"),
+        (["ppo", "mine=broken.py"], "broken.py cannot be used (SyntaxError"),
+        (["ppo", "mine=raises.py"], "raises.py cannot be used (ZeroDivisionError"),
+        (["ppo", "mine=ends.py"], "ends.py cannot be used (SystemExit"),
+        (["ppo", "mine=other.py"], "other.py cannot be used (AttributeError"),
+        (["ppo", "mine=foreign.py"], "foreign.py cannot be used (Unrecognized options: --exp-name"),
+    ],
+)
+def test_a_variant_that_cannot_be_trained_is_refused_in_one_line(variants, said, my_ppo, call):
+    texts = {"broken": "print(", "raises": "1 / 0", "ends": "raise SystemExit(3)", "other": "x = 1"}
+    texts["foreign"] = "import dataclasses\n@dataclasses.dataclass\nclass Args:\n    total_timesteps: int = 1\n"
+    for name, text in texts.items():
+        my_ppo.with_name(f"{name}.py").write_text(text)
+    status, printed, err = call("--out", "out", "--dry-run", "--variants", *variants)
+    assert (status, printed, err.count("\n")) == (2, "", 1) and said in err
+
+
+def test_every_variant_of_the_table_can_be_trained():
+    variants = [atari5.read_variant(word, 5_000_000) for word in atari5.VARIANTS]
+    assert [variant.name for variant in variants] == list(atari5.VARIANTS)
+    assert {variant.arguments["clip_coef"] for variant in variants} > {0.1, 0.16}
+
+
+def test_the_command_of_a_variant_of_one_s_own_can_be_pasted_and_importing_it_leaves_no_trace(my_ppo, call):
+    script = my_ppo.rename(my_ppo.with_name("my ppo"))  # a script may have any name
+    script.with_name("mine.py").write_text(script.read_text().replace("import math\n", "import math\nimport beside\n"))
+    script.with_name("beside.py").touch()
+    variants = ["one='my ppo' --clip-coef 0.2", "two=mine.py --no-norm-adv", "ppo", "ppo"]
+    status, printed, said = call(
+        "--games", "Pong", "--seeds", "1", "--out", "out", "--dry-run", "--variants", *variants
+    )
+    assert (status, said) == (0, "")
+    one, two, ppo = (shlex.split(line) for line in printed.splitlines())
+    assert one[4:8] == [sys.executable, str(script), "--clip-coef", "0.2"] and one[8:10] == ["--env-id", "Pong"]
+    assert two[5:7] == [str(script.with_name("mine.py")), "--no-norm-adv"] and two[two.index("--exp-name") + 1] == "two"
+    assert ppo[5] == str(ROOT / "ppo_atari.py")
+    assert not list(my_ppo.parent.glob("__pycache__/m*")) and not (my_ppo.parent / "out").exists()
+
+
+def test_a_run_of_another_text_of_its_script_is_neither_gone_on_with_nor_finished(my_ppo, tmp_path):
+    then = bookkeeping.provenance(str(my_ppo))["script"]
+    states = [look_at(tmp_path, step, "mine=my_ppo.py", then).state for step in (1024, 9216)]
+    assert states == ["queued", "done"]
+    my_ppo.write_text(my_ppo.read_text().replace("values.square()", "values.abs()") + "# another thought\n")
+    for step in (1024, 9216):
+        run = look_at(tmp_path, step, "mine=my_ppo.py", then)
+        assert run.state == "failed" and "is trained by another text of my_ppo.py; move it away" in run.reason
+    # The flag is named if both differ, and a run that has no hash is held against its arguments alone
+    assert "--gamma 0.9, not with 0.99" in look_at(tmp_path, 1024, "mine=my_ppo.py", then, gamma=0.9).reason
+    assert look_at(tmp_path, 9216, "mine=my_ppo.py").state == "done"
+    (tmp_path / "runs" / "Qbert__mine__1__1700000000" / "args.json").unlink()
+    run = make_run("Qbert", "mine=my_ppo.py", 10_000)
+    run.look(Args(out=tmp_path, total_timesteps=10_000))
+    assert run.state == "done"
+
+
+@pytest.mark.parametrize("flags", ["", "--clip-coef 0.10", "--clip_coef=1e-1 --norm-adv", "--target-kl None"])
+def test_another_spelling_of_its_flags_is_the_same_run(flags, my_ppo, tmp_path):
+    assert look_at(tmp_path, 1024, f"mine=my_ppo.py {flags}").state == "queued"
+    assert look_at(tmp_path, 1024, f"mine=my_ppo.py {flags}", clip_coef=0.2).state == "failed"
+
+
+@pytest.mark.parametrize(
+    "trained",
+    [
+        {"threads": 7},
+        {"log_dir": "elsewhere"},
+        {"eval_episodes": 3},
+        {"checkpoint_minutes": 0.0},
+        {"capture_video": True},
+        {"bf16": True},
+        {"compile": False},  # of older commits
+    ],
+    ids=str,
+)
+def test_what_leaves_the_curve_as_it_is_or_is_the_grid_s_makes_no_other_run(trained, tmp_path):
+    assert look_at(tmp_path, 1024, **trained).state == "queued"
+
+
+def test_bf16_among_a_variant_s_own_flags_is_part_of_it(my_ppo, tmp_path):
+    run = look_at(tmp_path, 9216, "mine=my_ppo.py --bf16")
+    assert run.state == "failed" and "--bf16 False, not with True" in run.reason
+    assert look_at(tmp_path, 9216, "mine=my_ppo.py --bf16", bf16=True).state == "done"
+
+
+def test_a_script_that_is_edited_while_the_grid_runs_starts_no_run_of_its_new_text(my_ppo, tmp_path, monkeypatch):
+    monkeypatch.setattr(atari5, "run_process", lambda *_: pytest.fail("it was started"))
+    run = make_run("CartPole-v1", "mine=my_ppo.py")
+    (tmp_path / "logs").mkdir()
+    my_ppo.write_text(my_ppo.read_text() + "# another thought\n")
+    assert "my_ppo.py has been edited since this call began" in atari5.train(run, Args(out=tmp_path), None)
+
+
+@pytest.mark.parametrize(
+    ("variants", "pair"),
+    [
+        (["ppo", "mine=my_ppo.py", "product"], ["--baseline", "ppo", "--challenger", "mine"]),
+        (["mine=my_ppo.py", "ppo"], ["--baseline", "mine", "--challenger", "ppo"]),
+        (["mine=my_ppo.py", "acppo", "ppo"], []),  # figures.py's own are ppo and acppo
+        (["mine=my_ppo.py"], []),
+    ],
+)
+def test_the_figures_compare_the_thesis_s_two_or_else_the_first_two_variants(variants, pair, my_ppo, call, monkeypatch):
+    drawn = []
+
+    def draw(command: list[str]) -> subprocess.CompletedProcess:
+        drawn.append(command)
+        return subprocess.CompletedProcess(command, 0)
+
+    monkeypatch.setattr(atari5.Run, "look", lambda run, _: setattr(run, "state", "done"))
+    monkeypatch.setattr(atari5.subprocess, "run", draw)
+    assert call("--out", "out", "--games", "Qbert", "--variants", *variants)[0] == 0
+    assert drawn == [
+        [sys.executable, str(ROOT / "benchmark" / "figures.py"), "--out", str(Path("out").resolve()), *pair]
+    ]
+
+
+def test_no_figure_shows_a_refused_run_as_the_grid_s(my_ppo, tmp_path, call, monkeypatch):
+    look_at(tmp_path, 9216, "ppo")
+    look_at(tmp_path, 9216, "mine=my_ppo.py", gamma=0.9)
+    monkeypatch.setattr(atari5.subprocess, "run", lambda *_: pytest.fail("figures were drawn"))
+    flags = ("--games", "Qbert", "--seeds", "1", "--total-timesteps", "10000", "--out", str(tmp_path))
+    status, _, said = call(*flags, "--variants", "ppo", "mine=my_ppo.py")
+    assert status == 1 and "--gamma 0.9, not with 0.99" in said and "1 of 2 runs are done" in said

@@ -20,7 +20,12 @@ BATCH = 1024  # agent steps of an iteration
 
 
 def make_arguments(variant: str, game: str, seed: int, iterations: int = 10, **more) -> dict:
-    epsilon = {"clip_coef": 0.16, "c": 1.0} if variant == "acppo" else {"clip_coef": 0.1}
+    epsilons = {
+        "acppo": {"clip_coef": 0.16, "c": 1.0},
+        "mine": {"clip_coef": 0.2},
+        "product": {"clip_coef": 0.1, "c": "inf"},
+    }
+    epsilon = epsilons.get(variant, {"clip_coef": 0.1}) if variant != "without" else {}
     sizes = {"total_timesteps": iterations * BATCH, "num_envs": 8, "num_steps": 128}
     return {"exp_name": variant, "env_id": game, "seed": seed, **sizes, **epsilon, **more}
 
@@ -67,9 +72,9 @@ def make_csvs(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=
     pd.concat(curves)[collect.CURVE_COLUMNS].to_csv(out / "curves.csv", index=False)
 
 
-def make_stages(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=()) -> list[claims.Stage]:
+def make_stages(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=(), **pair) -> list[claims.Stage]:
     make_csvs(out, runs, iterations, bf16)
-    return claims.make_stages(*collect.read_csvs(out))
+    return claims.make_stages(*collect.read_csvs(out), **pair)
 
 
 def make_pairs(out, differences: dict[str, list[float]], iterations: int = 2, **acppo) -> claims.Stage:
@@ -267,11 +272,11 @@ def test_both_spike_rates_as_counted_by_hand(tmp_path):
     ppo = [1] * 93 + [9] * 2 + [20] * 5  # 99th percentile 20, median 1
     acppo = [1] * 97 + [30] * 3
     (stage,) = make_stages(tmp_path, {("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}})
-    margins = claims.find_margins(stage.compared)
+    margins = claims.find_margins(stage)
     assert margins["relative spikes"]["Pong"] == pytest.approx([0 - 0.03])
     assert margins["own spikes"]["Pong"] == pytest.approx([0.05 - 0.03])
     assert margins["KL"]["Pong"] == pytest.approx([math.log(2.11 / 1.87)])
-    ppo_row, acppo_row = cells(claims.kl_table(stage.runs, stage.compared))[2:]
+    ppo_row, acppo_row = cells(claims.kl_table(stage))[2:]
     # The TV distance is 0.1: above PPO's 0.1 / 2, above AC-PPO's 0.16 / 2
     assert ppo_row == ["Pong", "ppo", "1", "102,400", "2.11", "1", "20", "20", "0.00%", "5.00%", "100.00%", "0.1000"]
     assert acppo_row[4:] == ["1.87", "1", "30", "30", "3.00%", "3.00%", "100.00%", "0.1000"]
@@ -280,9 +285,9 @@ def test_both_spike_rates_as_counted_by_hand(tmp_path):
 def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have(tmp_path):
     kl = {("ppo", "Pong", 1): [1] * 100, ("ppo", "Pong", 2): [1] * 90 + [9] * 10, ("acppo", "Pong", 1): [1] * 99 + [5]}
     (stage,) = make_stages(tmp_path, {key: {"kl": values} for key, values in kl.items()})
-    assert claims.spike_limit(stage.compared, "Pong") == 9
-    assert claims.find_margins(stage.compared)["relative spikes"]["Pong"] == [0]  # a 5 is one for seed 1 alone
-    rows = cells(claims.kl_table(stage.runs, stage.compared))[2:]
+    assert claims.spike_limit(stage, "Pong") == 9
+    assert claims.find_margins(stage)["relative spikes"]["Pong"] == [0]  # a 5 is one for seed 1 alone
+    rows = cells(claims.kl_table(stage))[2:]
     assert [row[8:10] for row in rows] == [["0.00%", "0.00%"], ["0.00%", "0.00%"]]  # 5 and 9 are not above ten times 1
     assert rows[0][2:8] == ["2", "102,400", "1.4", "1", "9", "9"]
 
@@ -388,6 +393,94 @@ def test_a_clip_ratio_holds_inside_its_band_for_every_run(tmp_path):
         assert cells(claims.claims_table(stage))[-1][1] == judged
 
 
+# ---------------------------------------------------------------------------------------- any two variants compared
+def make_trios(out, baseline: str, challenger: str) -> claims.Stage:
+    """Returns three seeds of each of ppo, acppo and mine, compared as given."""
+    columns = {
+        "ppo": {"mean_return_100": [0, 10], "kl": [1, 5], "avg_clip_ratio": 0.1},
+        "acppo": {"mean_return_100": [0, 9], "kl": [6, 6], "avg_clip_ratio": 0.11},
+        "mine": {"mean_return_100": [0, 12], "kl": [1, 1], "avg_clip_ratio": 0.13},
+    }
+    runs = {(variant, "Pong", seed): columns[variant] for variant in columns for seed in (1, 2, 3)}
+    (stage,) = make_stages(out, runs, baseline=baseline, challenger=challenger)
+    return stage
+
+
+@pytest.mark.parametrize(
+    ("baseline", "challenger", "base", "new", "near", "signs"),
+    [
+        ("ppo", "acppo", "PPO", "AC-PPO", "0.1 (0.08 to 0.12)", "✗✗✗?✓"),
+        ("ppo", "mine", "PPO", "mine", "0.1 (0.08 to 0.12)", "✓✓??✗"),
+        ("mine", "ppo", "mine", "PPO", "mine's ε, 0.2 (0.18 to 0.22)", "✗✗✗?✗"),
+    ],
+)
+def test_the_verdicts_are_on_the_variants_that_are_named(baseline, challenger, base, new, near, signs, tmp_path):
+    stage = make_trios(tmp_path, baseline, challenger)
+    rows = cells(claims.claims_table(stage))[2:]
+    assert [row[0] for row in rows] == [
+        f"{new}'s final score is above {base}'s",
+        f"{new}'s KL between policy updates is smaller",
+        f"{new} has fewer KL spikes above the 99th percentile of {base}'s",
+        f"{new} has fewer KL spikes above ten times the run's own median",
+        f"{new}'s average clip ratio is near {near}",
+    ]
+    assert "".join(row[1][0] for row in rows) == signs
+    header, _, pong = cells(claims.short_table([stage]))
+    assert header[3:] == [base, new, f"{base}'s KL ÷ {new}'s", f"{new} scores more"] and pong[-1][0] == signs[0]
+
+
+def test_a_third_variant_stands_beside_the_two_that_all_texts_name(tmp_path):
+    stage = make_trios(tmp_path, "mine", "ppo")
+    text = figures.results_part([stage])
+    for said in (
+        "variants acppo, mine, ppo",
+        "mine's above its own 99th percentile",
+        "pairs of mine and ppo with the same seed (the clip ratio by runs of ppo)",
+        "spikes: above mine's 99th percentile",
+        "| ppo − mine, by pairs |",
+        "| Pong | acppo | 3 |",
+    ):
+        assert said in text, said
+    assert "Dashed: mine's ε = 0.2. Thin" in figures.captions(stage)["avg_clip_ratio"]
+    figure = figures.draw_figure("avg_clip_ratio", stage)
+    (dashed,) = (line for line in figure.axes[0].lines if line.get_linestyle() == "--")
+    assert (dashed.get_ydata()[0], dashed.get_color()) == (0.2, figures.style(stage.drawn, "mine")["color"])
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["ppo", "acppo", "mine"]
+
+
+def test_a_challenger_s_clip_ratio_is_held_against_the_epsilon_of_the_baseline_s_runs(tmp_path):
+    for baseline, ratio, judged in (("mine", 0.19, "✓"), ("mine", 0.1, "✗"), ("ppo", 0.1, "✓"), ("product", 0.1, "?")):
+        runs = {
+            (variant, "Pong", seed): {"avg_clip_ratio": [ratio]} for variant in (baseline, "own") for seed in (1, 2, 3)
+        }
+        (stage,) = make_stages(tmp_path, runs, baseline=baseline, challenger="own")
+        assert cells(claims.claims_table(stage))[-1][1][0] == judged
+
+
+@pytest.mark.parametrize("variant", ["product", "without"])  # c = inf; and a script that has no ε
+def test_a_variant_without_an_epsilon_has_no_line_and_no_verdict_on_it(variant, tmp_path):
+    runs = {(name, "Pong", 1): {"kl": [1, 2]} for name in (variant, "ppo")}
+    (stage,) = make_stages(tmp_path, runs, baseline=variant, challenger="ppo")
+    claim = cells(claims.claims_table(stage))[-1]
+    assert claim[:2] == [f"PPO's average clip ratio is near {variant}'s ε, which no run has", "? 0 of 0"]
+    assert "Dashed" not in figures.captions(stage)["avg_clip_ratio"]
+    assert f"for {variant}" not in figures.captions(stage)["tv_distance"]
+    assert not [
+        line for line in figures.draw_figure("avg_clip_ratio", stage).axes[0].lines if line.get_linestyle() == "--"
+    ]
+
+
+def test_it_is_said_if_runs_of_one_variant_were_trained_by_several_texts_of_its_script(tmp_path):
+    keys = [("ppo", "Pong", 1), ("ppo", "Pong", 2), ("mine", "Pong", 1), ("mine", "Pong", 2), ("own", "Pong", 1)]
+    (stage,) = make_stages(tmp_path, {key: {"kl": [1]} for key in keys})
+    hashes = dict(zip(keys, ("sha256 a1", "sha256 b2", "sha256 c3", "sha256 c3", "unknown; sha256 d4")))
+    versions = [{"script": hashes[key]} for key in stage.runs[collect.KEY].itertuples(index=False, name=None)]
+    stage.runs["versions"] = list(map(json.dumps, versions))
+    assert "Trained by more than one text of the script: ppo. All in" in figures.coverage(stage)
+    stage.runs["versions"] = "{}"  # of older commits
+    assert "text of the script" not in figures.coverage(stage)
+
+
 # ------------------------------------------------------------------------------------------ tables and figures
 def test_the_score_table_gives_mean_and_sample_deviation_and_says_where_games_are_few(tmp_path):
     runs = {
@@ -397,16 +490,20 @@ def test_the_score_table_gives_mean_and_sample_deviation_and_says_where_games_ar
         ("acppo", "CartPole-v1", 1): {"mean_return_100": [math.nan, math.nan], "games_ended": 0},
     }
     (stage,) = make_stages(tmp_path, runs)
-    header, _, battle_zone, cartpole = cells(claims.score_table(stage.compared))
+    header, _, battle_zone, cartpole, *published = cells(claims.score_table(stage.compared))
+    assert header == ["game", "agent steps", "ppo", "acppo", "random", "human"]
     assert battle_zone[:4] == ["BattleZone", "2,048", "15.0 ± 7.1 (n = 2, 99 games)", "12.0 (n = 1)"]
-    ppo2 = header.index("openai/baselines ppo2 (CleanRL docs/benchmark), 10,000,000")
-    assert battle_zone[ppo2] == "19,980.0 ± 1,355.2"
-    assert cartpole == ["CartPole-v1", "2,048"] + ["–"] * (len(header) - 2)
+    assert battle_zone[4:] == ["2,360.0", "37,187.5"] and cartpole == ["CartPole-v1", "2,048", "–", "–", "–", "–"]
+    # Trainings of other lengths than ours stand in a table of their own
+    assert published[0] == ["game", "published", "agent steps", "score", "note"]
+    assert {(row[0], row[2]) for row in published[2:]} == {("BattleZone", "10,000,000")}
+    ppo2 = ["openai/baselines ppo2 (CleanRL docs/benchmark)", "10,000,000", "19,980.0 ± 1,355.2", "3 seeds"]
+    assert ["BattleZone", *ppo2] in published
 
 
 def test_the_human_normalised_table_says_where_seeds_are_too_few_for_an_interval(tmp_path):
     stage = make_pairs(tmp_path, {"Pong": [3.53]})  # a tenth of the human range
-    table = cells(claims.human_table(stage.compared))[2:]
+    table = cells(claims.human_table(stage))[2:]
     assert table[0] == ["ppo", "1", "1", f"{(10 + 20.7) / 35.3:.3f}", "no interval: one seed"]
     assert table[2] == ["acppo − ppo, by pairs", "1", "1", "0.100", "no interval: one seed"]
 
@@ -457,7 +554,7 @@ def test_a_pair_has_one_seed_and_a_seed_without_a_partner_is_in_none(tmp_path):
     runs = {("ppo", "Pong", seed): {"mean_return_100": [score]} for seed, score in ((1, 10), (2, 20), (3, 30))}
     runs |= {("acppo", "Pong", seed): {"mean_return_100": [score]} for seed, score in ((2, 21), (3, 32), (4, 40))}
     (stage,) = make_stages(tmp_path, runs)
-    assert list(claims.find_margins(stage.compared)["score"]["Pong"]) == [1, 2]
+    assert list(claims.find_margins(stage)["score"]["Pong"]) == [1, 2]
 
 
 # ------------------------------------------------------------------------------------------------- whole calls
@@ -499,6 +596,32 @@ def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_pa
     call(monkeypatch, "--out", default)
     after = contents(default) | {"above": (tmp_path / "README.md").read_bytes()}
     assert after == {name: data for name, data in before.items() if not name.startswith("runs/")}
+
+
+def test_another_pair_s_verdicts_go_into_the_grid_s_readme_alone(tmp_path, monkeypatch):
+    monkeypatch.setattr(figures, "DEFAULT_OUT", tmp_path)  # beside a project whose README has no place for a table
+    monkeypatch.setattr(figures, "ROOT", tmp_path / "nowhere")
+    monkeypatch.setattr(figures, "draw", lambda *_: None)
+    make_trios(tmp_path, "ppo", "acppo")
+    call(monkeypatch, "--out", tmp_path, "--challenger", "mine")
+    assert "| mine's final score is above PPO's | ✓ 3 of 3 |" in (tmp_path / "README.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--challenger", "thine"], "--challenger thine: no run is of this variant; give one of acppo, mine, ppo"),
+        (["--baseline", "thine"], "--baseline thine: no run is of this variant; give one of acppo, mine, ppo"),
+        (["--baseline", "acppo"], "--challenger acppo: is the baseline, too"),
+    ],
+)
+def test_a_pair_that_cannot_be_compared_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, capfd):
+    make_trios(tmp_path, "ppo", "acppo")
+    with pytest.raises(SystemExit) as ended:
+        call(monkeypatch, "--out", tmp_path, *flags)
+    out, err = capfd.readouterr()
+    assert (ended.value.code, out, err.count("\n")) == (2, "", 1) and said in err
+    assert not (tmp_path / "figures").exists()
 
 
 @pytest.mark.parametrize(

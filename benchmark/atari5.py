@@ -47,8 +47,8 @@ SCRIPTS = Path(__file__).resolve().parent.parent
 VARIANTS = {
     "ppo": "ppo_atari.py --clip-coef 0.1",  # the thesis's two, chapter 4
     "acppo": "acppo_atari.py --clip-coef 0.16 --c 1.0",
-    # Is it the adaptation, or only smaller steps? Its KL is AC-PPO's on Qbert, 100 iterations (match.py --on kl)
-    "ppo-matched": "ppo_atari.py --clip-coef 0.064",
+    # Is it the adaptation, or only smaller steps? Over a whole run of Qbert its KL is to be AC-PPO's (benchmark/README.md)
+    "ppo-matched": "ppo_atari.py --clip-coef 0.084",
     "ppo-wide": "ppo_atari.py --clip-coef 0.16",  # is it the adaptation, or the width?
     "product": "acppo_atari.py --clip-coef 0.027 --c inf",  # the product alone; δ by match.py
     "acppo-c0.25": "acppo_atari.py --clip-coef 0.16 --c 0.25",  # sensitivity to c ...

@@ -47,7 +47,7 @@ SCRIPTS = Path(__file__).resolve().parent.parent
 VARIANTS = {
     "ppo": "ppo_atari.py --clip-coef 0.1",  # the thesis's two, chapter 4
     "acppo": "acppo_atari.py --clip-coef 0.16 --c 1.0",
-    # Is it the adaptation, or only smaller steps? Over a whole run of Qbert its KL is to be AC-PPO's (benchmark/README.md)
+    # Is it the adaptation, or only smaller steps? Its KL over a whole run of Qbert is to be AC-PPO's (README.md here)
     "ppo-matched": "ppo_atari.py --clip-coef 0.084",
     "ppo-wide": "ppo_atari.py --clip-coef 0.16",  # is it the adaptation, or the width?
     "product": "acppo_atari.py --clip-coef 0.027 --c inf",  # the product alone; δ by match.py

@@ -21,6 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import acppo_atari
 import bookkeeping
 import ppo_atari
+import siblings
 from wrappers import make_envs
 
 ROOT = Path(__file__).parent.parent
@@ -32,16 +33,30 @@ SMALL = {"num_envs": 4, "num_steps": 32, "threads": 1}
 PATIENCE = 600  # seconds that a process is waited for: they end a test that hangs, and decide nothing else
 
 
-@pytest.fixture(params=[acppo_atari, pytest.param(ppo_atari, marks=pytest.mark.slow)], ids=["acppo", "ppo"])
+@pytest.fixture
 def script(request):
     """A training script: one in the plain suite, because tests/test_siblings.py holds the other to the same lines."""
     return request.param
 
 
-@pytest.fixture(params=SCRIPTS.values(), ids=SCRIPTS)
+@pytest.fixture
 def each_script(request):
     """Both scripts in the plain suite too, for the mathematics and the smoke runs."""
     return request.param
+
+
+PARAMS = {
+    "script": {"argvalues": [acppo_atari, pytest.param(ppo_atari, marks=pytest.mark.slow)], "ids": ["acppo", "ppo"]},
+    "each_script": {"argvalues": list(SCRIPTS.values()), "ids": list(SCRIPTS)},
+}
+
+
+def pytest_generate_tests(metafunc):
+    """Gives the two fixtures their scripts, or that of `--script` alone."""
+    given = metafunc.config.stash.get(siblings.GIVEN, None)
+    for name in PARAMS.keys() & set(metafunc.fixturenames):
+        params = PARAMS[name] if given is None else {"argvalues": [given], "ids": [given.__name__]}
+        metafunc.parametrize(name, **params, indirect=True)
 
 
 # ---------------------------------------------------------------------------------------------- the logs of a run
@@ -140,6 +155,11 @@ def call_main(monkeypatch, capfd, tmp_path):
 
 
 # -------------------------------------------------------------------------------------------------- as a process
+def environment(directory: Path = ROOT / "tests", **variables: str) -> dict[str, str]:
+    """The variables of a process that imports from a directory, and from the project, from anywhere."""
+    return {**os.environ, "PYTHONPATH": f"{directory}{os.pathsep}{ROOT}", **variables}
+
+
 class Process(subprocess.Popen):
     """A script as a user starts it, with the tests' environments importable."""
 
@@ -156,7 +176,7 @@ class Process(subprocess.Popen):
         super().__init__(
             [*before, sys.executable, script.__file__, *flags],
             cwd=cwd,
-            env={**os.environ, "PYTHONPATH": str(ROOT / "tests")},
+            env=environment(),
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -47,6 +47,7 @@ class FirstGradient(Exception):
     """Stops a training at its first gradient, before it is clipped."""
 
 
+@pytest.mark.thesis("Agent", "normalize", "clip_range", "surrogate", "value_loss")
 def test_loss_and_gradient_agree_with_the_plain_form(each_script, tmp_path, monkeypatch):
     """A rollout as one minibatch, fitted by parameters that have moved a little since, so that ratios are not all 1."""
     script = each_script
@@ -93,6 +94,7 @@ def test_loss_and_gradient_agree_with_the_plain_form(each_script, tmp_path, monk
     assert (gradient - expected).norm() / expected.norm() < 1e-4
 
 
+@pytest.mark.thesis("Agent")
 def test_bfloat16_is_for_the_trunk_alone(script, monkeypatch):
     torch.manual_seed(1)
     agent = script.Agent((4, 84, 84), 6, bf16=True)
@@ -107,6 +109,7 @@ def test_bfloat16_is_for_the_trunk_alone(script, monkeypatch):
     assert torch.allclose(agent(obs)[1], value, atol=0.02)
 
 
+@pytest.mark.thesis("Agent")
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 def test_the_trunk_gets_each_brightness_rounded_once(script, dtype):
     """As if it were divided by 255 in float32 first, and then cast: the same bits for all 256 values."""
@@ -119,6 +122,7 @@ def test_the_trunk_gets_each_brightness_rounded_once(script, dtype):
     assert torch.equal(entered[0], expected.expand(1, 4, 84, 84))
 
 
+@pytest.mark.thesis("Agent")
 def test_bfloat16_moves_a_policy_less_than_an_update_does(script):
     """The noise floor of the KL under bfloat16: the same network, its logits well apart, in both precisions."""
     torch.manual_seed(1)

@@ -25,6 +25,7 @@ def brute_force_gae(rewards, values, next_values, terminations, truncations, gam
     return advantages
 
 
+@pytest.mark.thesis("compute_gae")
 def test_gae_matches_the_brute_force_sum(each_script):
     random = np.random.default_rng(1)
     shape = (20, 6)
@@ -42,6 +43,7 @@ def constant_rollout(reward: float, value: float, num_steps: int):
     return reward * full, value * full, value * full, never, never
 
 
+@pytest.mark.thesis("compute_gae")
 def test_gae_of_reward_one_and_value_zero_is_a_geometric_sum(each_script):
     gamma, gae_lambda, num_steps = 0.99, 0.95, 50
     advantages = each_script.compute_gae(*constant_rollout(1.0, 0.0, num_steps), gamma, gae_lambda)
@@ -50,11 +52,13 @@ def test_gae_of_reward_one_and_value_zero_is_a_geometric_sum(each_script):
         assert advantages[num_steps - steps_left].item() == pytest.approx(expected)
 
 
+@pytest.mark.thesis("compute_gae")
 def test_gae_of_the_true_value_is_zero(each_script):
     advantages = each_script.compute_gae(*constant_rollout(1.0, 1 / (1 - 0.9), 50), 0.9, 0.95)
     assert advantages.abs().max() < 1e-12
 
 
+@pytest.mark.thesis("compute_gae")
 def test_gae_is_the_same_for_whole_number_rewards_of_any_dtype(each_script):
     rewards, never = torch.tensor([[1], [0], [-1]]), torch.zeros(3, 1, dtype=torch.bool)
     values = torch.tensor([[0.3], [0.2], [0.1]])
@@ -62,6 +66,7 @@ def test_gae_is_the_same_for_whole_number_rewards_of_any_dtype(each_script):
     assert torch.equal(*both) and both[0].abs().min() > 0.01
 
 
+@pytest.mark.thesis("Agent")
 def test_a_network_says_which_observations_it_takes(each_script):
     with pytest.raises(ValueError, match=r"\(4, 64, 64\); give \(channels, 84, 84\) or \(size,\)"):
         each_script.Agent((4, 64, 64), 6)
@@ -129,6 +134,33 @@ def test_a_large_c_with_epsilon_c_delta_approaches_the_product_only_objective():
     assert torch.allclose(nearby, at_infinity, atol=1e-3)
 
 
+def gradients_of_the_surrogate(script):
+    """Of ratios from 0.02 to 3 (row 49 is 1) at two clip ranges and advantages of both signs, with all of these."""
+    ratio, clip, advantages = torch.meshgrid(
+        torch.arange(1, 151, dtype=torch.float64) / 50,
+        torch.tensor([0.05, 0.3], dtype=torch.float64),
+        torch.tensor([-2.0, -0.5, 0.5, 2.0], dtype=torch.float64),
+        indexing="ij",
+    )
+    flat_ratio = ratio.flatten().requires_grad_()
+    objective = script.surrogate(flat_ratio, advantages.flatten(), clip.flatten())
+    return torch.autograd.grad(objective.sum(), flat_ratio)[0].reshape(ratio.shape), ratio, advantages
+
+
+def test_of_a_policy_that_has_not_moved_the_surrogates_gradient_is_the_policy_gradient(each_script):
+    """At ρ = 1 it is Â, for PPO and all its kin: they differ in how they brake from there on."""
+    gradient, ratio, advantages = gradients_of_the_surrogate(each_script)
+    assert (ratio[49] == 1).all() and torch.allclose(gradient[49], advantages[49], atol=1e-12)
+
+
+def test_a_ratio_that_has_moved_as_the_advantage_wants_is_pushed_on_no_harder_than_at_one(each_script):
+    gradient, ratio, advantages = gradients_of_the_surrogate(each_script)
+    moved = (ratio - 1) * advantages > 0
+    assert moved.sum() == 4 * (100 + 49)
+    assert (gradient * advantages.sign() <= advantages.abs() + 1e-12)[moved].all()
+
+
+@pytest.mark.thesis("surrogate")
 def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(each_script):
     ratio = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.05])
     advantages = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0])
@@ -137,6 +169,7 @@ def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(eac
     assert each_script.surrogate(ratio, advantages, clip).tolist() == pytest.approx(expected)
 
 
+@pytest.mark.thesis("value_loss")
 def test_the_value_loss_is_half_the_squared_error_and_the_larger_of_two_when_clipped(each_script):
     new_values, values, returns = torch.tensor([1.0, 1.0]), torch.tensor([0.0, 0.0]), torch.tensor([3.0, 0.0])
     assert each_script.value_loss(new_values, values, returns, None).item() == pytest.approx(0.5 * (4 + 1) / 2)
@@ -144,6 +177,7 @@ def test_the_value_loss_is_half_the_squared_error_and_the_larger_of_two_when_cli
     assert each_script.value_loss(new_values, values, returns, 0.1).item() == pytest.approx(0.5 * (2.9**2 + 1) / 2)
 
 
+@pytest.mark.thesis("normalize")
 def test_normalised_advantages_have_mean_zero_and_deviation_one(each_script):
     normalised = each_script.normalize(torch.tensor([1.0, 2.0, 3.0, 6.0]))
     assert normalised.mean().item() == pytest.approx(0, abs=1e-6)

@@ -6,6 +6,7 @@ import os
 import random
 import re
 import resource
+import shlex
 import shutil
 import signal
 import sys
@@ -53,7 +54,7 @@ def test_stopped_and_resumed_logs_what_straight_through_logs(script, env_id, tmp
     stopped = call_main(script, *flags, "--log-dir", "stopped", "--stop-at", "600")
     run_dir = run_dir_in(tmp_path / "stopped")
     assert stopped[:2] == (0, "") and checkpoint_of(run_dir)["global_step"] == 640
-    command = f"{sys.executable} {script.__file__} --resume {run_dir}"  # from any directory
+    command = shlex.join([sys.executable, script.__file__, "--resume", str(run_dir)])  # from any directory
     assert stopped.err == f"At --stop-at; go on with: {command}\n"
     status, played, said = call_main(script, "--resume", f"stopped/{run_dir.name}")
     assert (status, said) == (0, "") and played.startswith("10 games at step 1,280")
@@ -200,6 +201,7 @@ def test_what_cannot_change_is_refused(script, finished, call_main, flags, messa
     assert call_main(script, "--resume", "finished", *flags) == (2, "", message + "\n")
 
 
+@pytest.mark.thesis
 def test_the_run_of_the_other_script_is_refused(script, finished_runs, call_main):
     (other,) = set(SCRIPTS.values()) - {script}
     run_dir = finished_runs(other)
@@ -219,7 +221,8 @@ def test_a_directory_without_a_checkpoint_is_refused(script, contents, tmp_path,
 def test_a_run_is_found_by_its_checkpoint_and_named_if_its_parent_is_given(script, finished, tmp_path, call_main):
     status, out, err = call_main(script, "--resume", "finished/checkpoint.pt")
     assert (status, err) == (0, "") and out.startswith("finished is finished up to --total-timesteps")
-    assert f"not evaluated, do that with: {sys.executable} {script.__file__} --evaluate {finished}" in out
+    command = [sys.executable, script.__file__, "--evaluate", str(finished)]
+    assert f"not evaluated, do that with: {shlex.join(command)}" in out
     said = f"--resume {tmp_path}: it holds no checkpoint; give a run in it: finished\n"
     assert call_main(script, "--resume", str(tmp_path)) == (2, "", said)
 

@@ -1,11 +1,16 @@
-"""The two scripts are one file but for the clip range: the diff is AC-PPO, so it has a budget."""
+"""The two scripts are one file but for the clip range: the diff is AC-PPO, so it has a budget.
 
-import ast
-import difflib
+Other siblings, which `--script` names, are imported from anywhere, or refused.
+"""
 
-import acppo_atari
-import ppo_atari
+import sys
+
+import pytest
+
 from conftest import ROOT
+from siblings import PPO, changed_definitions, changes, code_diff, lines_of, load
+
+ACPPO = ROOT / "acppo_atari.py"
 
 PLACES = {  # places that a hunk may touch: lines from the one to the other, the second not included
     "docstring": ('"""', "Sections: "),
@@ -13,11 +18,6 @@ PLACES = {  # places that a hunk may touch: lines from the one to the other, the
     "clip_range": ("def clip_range(", "def surrogate("),
     "the line that calls it": ("clip = clip_range(", "pg_loss = "),
 }
-
-
-def lines_of(script) -> list[str]:
-    with open(script.__file__, encoding="utf-8") as file:
-        return file.read().splitlines()
 
 
 def place_of(line_number: int, lines: list[str]) -> str:
@@ -31,31 +31,52 @@ def place_of(line_number: int, lines: list[str]) -> str:
 
 
 def test_the_sibling_diff_keeps_its_budget():
-    base, sibling = lines_of(ppo_atari), lines_of(acppo_atari)
-    opcodes = difflib.SequenceMatcher(None, base, sibling, autojunk=False).get_opcodes()
-    changes = [opcode for opcode in opcodes if opcode[0] != "equal"]
-    lines_out = sum(i2 - i1 for _, i1, i2, _, _ in changes)
-    lines_in = sum(j2 - j1 for _, _, _, j1, j2 in changes)
-    places_out = {place_of(i, base) for _, i1, i2, _, _ in changes for i in range(i1, i2)}
-    places_in = {place_of(j, sibling) for _, _, _, j1, j2 in changes for j in range(j1, j2)}
-    assert places_out <= PLACES.keys() and places_in <= PLACES.keys()
-    assert len(changes) <= 6
-    assert lines_out <= 15
-    assert lines_in <= 30
-
-
-def without_docstrings(script) -> list[str]:
-    """A script's lines but those of its module's, classes', functions' and fields' docstrings."""
-    lines = lines_of(script)
-    for node in ast.walk(ast.parse("\n".join(lines))):
-        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
-            lines[node.lineno - 1 : node.end_lineno] = [None] * (node.end_lineno - node.lineno + 1)
-    return [line for line in lines if line is not None]
+    base, sibling = lines_of(PPO), lines_of(ACPPO)
+    hunks = changes(base, sibling)
+    lines_out = [i for i1, i2, _, _ in hunks for i in range(i1, i2)]
+    lines_in = [j for _, _, j1, j2 in hunks for j in range(j1, j2)]
+    assert {place_of(i, base) for i in lines_out} | {place_of(j, sibling) for j in lines_in} <= PLACES.keys()
+    assert len(hunks) <= 6
+    assert len(lines_out) <= 15
+    assert len(lines_in) <= 30
 
 
 def test_the_readme_shows_the_diff_as_it_is():
-    both = without_docstrings(ppo_atari), without_docstrings(acppo_atari)
-    diff = list(difflib.unified_diff(*both, n=0, lineterm=""))[2:]
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     shown = readme.split("<!-- sibling diff -->\n```diff\n")[1].split("\n```\n<!-- end -->")[0]
-    assert [line for line in shown.splitlines() if line] == [line for line in diff if not line.startswith("@@")]
+    diff = [line for line in code_diff(PPO, ACPPO) if not line.startswith("@@")]
+    assert [line for line in shown.splitlines() if line] == diff
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "cannot be imported (FileNotFoundError: "),
+        ("1 / 0", "cannot be imported (ZeroDivisionError: division by zero)"),
+        ("raise ValueError('two\\nlines')", "cannot be imported (ValueError: two lines)"),
+        ("import sys; sys.exit('no')", "cannot be imported (SystemExit: no)"),
+        ("class Args: pass", "has no Agent, train, main; begin with a copy of ppo_atari.py"),
+    ],
+)
+def test_a_script_that_is_no_sibling_is_refused_in_one_line(text, said, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    path = tmp_path / "no_sibling.py"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(pytest.UsageError) as refused:
+        load(path)
+    assert str(refused.value).startswith(f"--script {path}: it {said}") and "\n" not in str(refused.value)
+
+
+def test_a_script_from_anywhere_can_import_the_files_beside_it(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "idea_beside_it.py").write_text("EPSILON = 0.3")
+    own = "from idea_beside_it import EPSILON\n\n\ndef clip_range("
+    (tmp_path / "my idea.py").write_text(PPO.read_text(encoding="utf-8").replace("def clip_range(", own))
+    script = load(tmp_path / "my idea.py")
+    assert (script.__name__, script.EPSILON, script.Args().exp_name) == ("my idea", 0.3, "my-idea")
+
+
+def test_what_a_script_does_in_its_own_way_is_known_by_the_text_of_its_functions():
+    assert changed_definitions(ACPPO) == {"Args", "clip_range", "train"}
+    assert changed_definitions(PPO) == set()

@@ -143,7 +143,7 @@ def log_softmax(logits: torch.Tensor) -> np.ndarray:
 )
 def test_every_logged_metric_is_what_it_is_defined_to_be(script, arguments, tmp_path, monkeypatch):
     """One iteration with a large step; its rollout is kept, and each number worked out again in numpy."""
-    args = script.Args(threads=1, learning_rate=0.01, **arguments)
+    args = script.Args(threads=1, learning_rate=0.01, clip_coef=0.1, **arguments)
     torch.manual_seed(args.seed)
     envs = make_envs(args.env_id, args.num_envs)
     before = script.Agent(envs.single_observation_space.shape, 2)  # the same first draws as in train

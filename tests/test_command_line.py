@@ -235,6 +235,9 @@ def test_an_argument_outside_its_bounds_is_refused_by_name(name, bad, said, good
         check(acppo_atari.Args(**{name: value}))
 
 
+SIZES = {"num_envs": 8, "num_steps": 128, "num_minibatches": 4, "norm_adv": True}  # a rollout of 1024 samples
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -248,14 +251,14 @@ def test_an_argument_outside_its_bounds_is_refused_by_name(name, bad, said, good
 )
 def test_arguments_that_do_not_go_together_are_refused(script, arguments, said, capfd):
     with pytest.raises(SystemExit) as ended:
-        check(script.Args(**arguments))
+        check(script.Args(**SIZES | arguments))
     assert ended.value.code == 2 and said in capfd.readouterr().err
 
 
 def test_arguments_at_the_edge_of_going_together_are_taken(script):
-    check(script.Args(total_timesteps=1024))
-    check(script.Args(num_minibatches=512))
-    check(script.Args(num_minibatches=1024, norm_adv=False))
+    check(script.Args(**SIZES | {"total_timesteps": 1024}))
+    check(script.Args(**SIZES | {"num_minibatches": 512}))
+    check(script.Args(**SIZES | {"num_minibatches": 1024, "norm_adv": False}))
 
 
 def test_importing_a_script_leaves_the_environment_alone():

@@ -71,7 +71,7 @@ def pytest_on(script: Path, *selection: str) -> subprocess.CompletedProcess:
     return subprocess.run(command, cwd=script.parent, capture_output=True, text=True, timeout=PATIENCE)
 
 
-CHECKED = "test_mathematics or test_fast_form or every_logged or documented_tag or straight_through or in_one_line"
+CHECKED = "test_mathematics or every_logged or other_environments or straight_through or in_one_line"
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_spo_keeps_what_every_sibling_promises_and_its_diff_is_shown(tmp_path):
     assert "\n+    clip_coef: PositiveFloat = 0.2\n" in ended.stdout
     assert re.search(r"SKIPPED .*: spo_atari.py has its own surrogate\n", ended.stdout)
     passed, skipped = map(int, re.search(r"\n(\d+) passed, (\d+) skipped", ended.stdout).groups())
-    assert passed > 30 > skipped > 0
+    assert passed > 20 and skipped == 1
 
 
 FLIPPED = {

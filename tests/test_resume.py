@@ -35,7 +35,7 @@ from conftest import (
 )
 from wrappers import env_seeds, make_envs
 
-CARTPOLE = {"env_id": "CartPole-v1", **SMALL}
+CARTPOLE = {"env_id": "CartPole-v1", **SMALL, "learning_rate": 2.5e-4}
 ITERATION = SMALL["num_envs"] * SMALL["num_steps"]
 CANNOT_END = {"total_timesteps": 10**9}  # before a test lets it
 EVERY_ITERATION = "charts/learning_rate"

@@ -12,9 +12,10 @@ import ppo_atari
 from conftest import SHORT_CARTPOLE, TINY_PIXELS, open_run, reproducible, scalars, train, values
 from wrappers import env_seeds, make_envs
 
+UPDATE = {"num_minibatches": 4, "update_epochs": 4}  # counted on below; a script of one's own may have other defaults
 # Two small rollouts of each kind. Screens take a large network, so that of them there are fewer.
-CARTPOLE = {"env_id": "CartPole-v1", "num_envs": 4, "num_steps": 32, "total_timesteps": 256}
-SCREENS = {"num_envs": 2, "num_steps": 16, "total_timesteps": 64}
+CARTPOLE = {"env_id": "CartPole-v1", "num_envs": 4, "num_steps": 32, "total_timesteps": 256, **UPDATE}
+SCREENS = {"num_envs": 2, "num_steps": 16, "total_timesteps": 64, **UPDATE}
 ONE_ROLLOUT = {**CARTPOLE, "total_timesteps": 128}
 
 
@@ -305,7 +306,7 @@ def test_the_average_clip_ratio_counts_a_range_above_one_as_one(tmp_path):
 @pytest.mark.parametrize("env_id", [TINY_PIXELS, SHORT_CARTPOLE, "Breakout"])
 def test_a_truncation_bootstraps_from_the_observation_it_ended_on(script, env_id, tmp_path, monkeypatch):
     """The environments are played again with the recorded actions; the agent, at learning rate 0, stays the same."""
-    args = script.Args(threads=1, learning_rate=0.0, update_epochs=1, **{**ONE_ROLLOUT, "env_id": env_id})
+    args = script.Args(threads=1, learning_rate=0.0, **{**ONE_ROLLOUT, "env_id": env_id, "update_epochs": 1})
     rollout, gae = Recorder(monkeypatch, script, "act"), Recorder(monkeypatch, script, "compute_gae")
     envs = make_envs(env_id, args.num_envs, max_frames=100)
     with open_run(script, tmp_path) as run:
@@ -378,7 +379,7 @@ def test_a_target_kl_is_held_against_the_mean_over_an_epoch(script, tmp_path, mo
     assert (len(objective.calls) == 4) == (mean > last)
 
 
-@pytest.mark.thesis("Agent")
+@pytest.mark.thesis("Agent", "orthogonal", "tanh_mlp")
 @pytest.mark.parametrize("obs_shape", [(4,), (4, 84, 84)], ids=["flat", "screens"])
 def test_a_new_network_is_orthogonal_with_a_nearly_uniform_policy(script, obs_shape):
     """Gain √2 in the hidden layers, 0.01 for the policy and 1 for the value, as in OpenAI's baselines."""

@@ -16,6 +16,7 @@ Sections: arguments, network, mathematics, training, command line.
 """
 
 import math
+import os
 import signal
 import sys
 from collections.abc import Callable
@@ -23,7 +24,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 if __name__ == "__main__" and signal.getsignal(signal.SIGINT) == signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the imports without a traceback
+    signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))  # Ctrl-C ends the imports without a traceback
 
 import bookkeeping
 

@@ -11,6 +11,7 @@ that is passed in as a function, so this file knows no network and no loss.
 import contextlib
 import csv
 import ctypes
+import glob
 import hashlib
 import importlib.metadata
 import inspect
@@ -65,14 +66,18 @@ def say(text: str, end: str = "\n") -> None:
     """Writes to standard error and ignores errors: a closed pipe or a full disk must not end a run."""
     start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
     with contextlib.suppress(OSError):
-        if sys.stderr is not None:  # None: closed before Python started, and 2 may be a file of ours
-            os.write(2, (start + text + end).encode(errors="replace"))
+        os.write(2, (start + text + end).encode(errors="surrogateescape"))
 
 
 def tell(text: str) -> None:
     """Writes to standard output and ignores errors: a result that nobody reads is no failure."""
     with contextlib.suppress(OSError):
-        os.write(1, (text + "\n").encode(errors="replace"))
+        os.write(1, (text + "\n").encode(errors="surrogateescape"))
+
+
+def in_utf8(text: str, errors: str = "replace") -> str:
+    """Returns a text of the command line as its bytes read in UTF-8, whatever the locale has made of them."""
+    return text.encode(errors="surrogateescape").decode(errors=errors)
 
 
 def refuse(given: str, advice: object) -> typing.NoReturn:
@@ -88,6 +93,11 @@ def flag(name: str, value: object) -> str:
 
 def parse(args_class: Callable, **given):
     """Parses the command line with tyro. `--help` that has no reader, or no letter for ε, is no failure."""
+    for descriptor in range(3):  # of those that were closed before Python started, a file of ours would get the number
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)
     if sys.stdout is None:  # closed before Python started
         sys.stdout = open(os.devnull, "w", encoding="utf-8")
     sys.stdout.reconfigure(errors="replace")
@@ -98,7 +108,7 @@ def parse(args_class: Callable, **given):
             sys.stdout.flush()
     except OSError:  # Python would flush again at its end, and fail
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-        sys.exit()
+        sys.exit(0 if {"-h", "--help"} & set(sys.argv) else 2)
 
 
 def file_name(script: str) -> str:
@@ -107,16 +117,24 @@ def file_name(script: str) -> str:
 
 
 def write_text(path: str | os.PathLike, text: str) -> None:
-    """Replaces a file by UTF-8 text: writes a new one beside it and renames that. One of the two is always whole."""
+    """Replaces a file by UTF-8 text, as `write_bytes` does."""
+    write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | os.PathLike, data: bytes) -> None:
+    """Replaces a file: writes a new one beside it and renames that. One of the two is always whole.
+
+    Raises OSError, with the file's name in it.
+    """
     new = f"{os.fspath(path)}.new"
     try:
-        with open(new, "w", encoding="utf-8", newline="\n") as file:
-            file.write(text)
+        with open(new, "wb") as file:
+            file.write(data)
         os.replace(new, path)
-    except OSError:
+    except OSError as error:
         with contextlib.suppress(OSError):
             os.remove(new)  # half of it would fill the disk further
-        raise
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from error
 
 
 def append(path: str, data: bytes) -> None:
@@ -198,8 +216,10 @@ def check(args) -> None:
     """Refuses the first argument that is out of its bounds or breaks one of `args.rules()`."""
     for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
-        if isinstance(value, str) and value != value.encode(errors="replace").decode():
-            refuse(flag(name, value), "give it in UTF-8")  # TensorBoard can take no other paths
+        try:
+            in_utf8(str(value), errors="strict")
+        except UnicodeDecodeError:  # it could not be written into the run's record
+            refuse(flag(name, value), "give it in UTF-8")
         for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # `X | None` has X among its args
             for bounds in getattr(kind, "__metadata__", ()):
                 if isinstance(bounds, Bounds) and not bounds.allow(value):
@@ -222,10 +242,12 @@ class RunDirectory:
         self.path, self.checkpoint = path, os.path.join(path, "checkpoint.pt")
         # On a file, because NFS does not pass locks on directories on. The lock dies with its process, the file stays.
         self.lock = filelock.FileLock(os.path.join(path, "run.lock"))
-        if os.access(path, os.W_OK):
+        if self.can_be_written(path):
             self.lock.acquire(blocking=False)
+        self.trains = False
         self.event_file: EventFile | None = None  # of this start
         self.not_written: set[str] = set()
+        self.films_cut_short = 0  # by a signal
         self.iteration = 0  # of the last checkpoint
         self.num_starts = 0  # each start of a run plays games of its own
         self.last_scores = deque(maxlen=100)  # raw returns of whole games
@@ -243,8 +265,7 @@ class RunDirectory:
                     break
             return cls(path)
         except OSError as error:
-            with contextlib.suppress(OSError):
-                os.rmdir(path)  # made, but not to be locked
+            shutil.rmtree(path, ignore_errors=True)  # made, but not to be locked
             refuse(flag("log_dir", args.log_dir), f"cannot be written ({error.strerror}); give another directory")
 
     @classmethod
@@ -253,12 +274,12 @@ class RunDirectory:
         if os.path.basename(path) == "checkpoint.pt":
             path = os.path.dirname(path) or "."
         try:
-            in_it = {file.name: file.path for file in os.scandir(path)}
-            if "checkpoint.pt" not in in_it:  # asked before the lock, which leaves a file
-                runs = sorted(run for run in in_it if os.path.exists(os.path.join(in_it[run], "checkpoint.pt")))
-                advice = f"give a run in it: {' '.join(runs)}" if runs else "start the run anew"
+            if "checkpoint.pt" not in os.listdir(path):  # asked before the lock, which leaves a file
+                below = [run for level in ("*", "*/*") for run in glob.glob(f"{level}/checkpoint.pt", root_dir=path)]
+                runs = " ".join(sorted(map(os.path.dirname, below)))
+                advice = f"give a run in it: {runs}" if runs else "start the run anew"
                 raise ValueError(f"it holds no checkpoint; {advice}")
-            if name == "resume" and not os.access(path, os.W_OK):
+            if name == "resume" and not cls.can_be_written(path):
                 raise ValueError("it cannot be written")
             run = cls(path)
             return run, run.load(args_class)
@@ -266,6 +287,12 @@ class RunDirectory:
             refuse(flag(name, path), "another process holds it; wait for its end")
         except (OSError, ValueError) as error:
             refuse(flag(name, path), getattr(error, "strerror", None) or error)
+
+    @staticmethod
+    def can_be_written(path: str) -> bool:
+        """Says whether this user may write a run's directory and its lock, which another user may have made."""
+        lock = os.path.join(path, "run.lock")
+        return os.access(path, os.W_OK) and (os.access(lock, os.W_OK) or not os.path.exists(lock))
 
     def close(self) -> None:
         """Lets go of the directory, for another process or object to open it."""
@@ -309,6 +336,7 @@ class RunDirectory:
         """
         import torch
 
+        self.trains = True
         if state is not None:
             self.restore_agent(state, agent, "resume")
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
@@ -340,7 +368,7 @@ class RunDirectory:
         provenance_rows = {"command": about["command"], "started_at_step": step, **about["provenance"]}
         for tag, rows in (("hyperparameters", about["args"]), ("provenance", provenance_rows)):
             table = ["|name|value|", "|-|-|", *(f"|{name}|{value}|" for name, value in rows.items())]
-            summaries.append(summary.text(tag, "\n".join(table)))
+            summaries.append(summary.text(tag, in_utf8("\n".join(table))))
         self.append_events([(step, summary) for summary in summaries])
 
     def log(self, step: int, scalars: dict[str, float], games: list[tuple[int, float, int]] = ()) -> None:
@@ -370,7 +398,7 @@ class RunDirectory:
         rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
         header = [] if os.path.exists(path) else [("step", "game", "score", "length")]
         csv.writer(text := io.StringIO()).writerows([*header, *rows])
-        with self.reporting("the evaluation", then=""):
+        with self.reporting("the evaluation"):
             EventFile(self.path, ".eval").append([(step, f"eval/{name}", value) for name, value in stats.items()])
             append(path, text.getvalue().encode())
 
@@ -406,8 +434,10 @@ class RunDirectory:
                 os.replace(new, self.checkpoint)
                 with contextlib.suppress(OSError):  # not every file system can; nothing is lost if it works without
                     directory = os.open(self.path, os.O_RDONLY)
-                    os.fsync(directory)
-                    os.close(directory)
+                    try:
+                        os.fsync(directory)
+                    finally:
+                        os.close(directory)
                 self.iteration = state["iteration"]
             except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
                 with contextlib.suppress(OSError):
@@ -415,13 +445,13 @@ class RunDirectory:
                 raise OSError(str(error)) from error
 
     @contextlib.contextmanager
-    def reporting(self, what: str, then: str = "; the run goes on") -> Iterator[None]:
+    def reporting(self, what: str) -> Iterator[None]:
         """Says once that `what` cannot be written, and goes on."""
         try:
             yield
         except OSError as error:
             if what not in self.not_written:
-                say(f"{self.path}: {what} cannot be written ({error}){then}")
+                say(f"{self.path}: {what} cannot be written ({error}){'; the run goes on' if self.trains else ''}")
             self.not_written.add(what)
 
     def event_files(self) -> dict[str, int]:
@@ -518,7 +548,8 @@ class StatusLine:
         step, last_step = iteration * args.batch_size, args.last_iteration * args.batch_size
         line = f"step {step:,} of {last_step:,}, {sps:.0f} SPS{score}, {left} left"
         if os.isatty(2):
-            line = line[: shutil.get_terminal_size().columns - 1]  # a line that wraps cannot be written over
+            columns = os.get_terminal_size(2).columns or 80
+            line = line[: columns - 1]  # a line that wraps cannot be written over
             say(line, end="\n" if iteration == args.last_iteration else "")
         elif time.perf_counter() >= self.due:
             say(line)
@@ -540,26 +571,32 @@ def command_line(args) -> str:
                 words[-1] += f"={value}"
             elif not isinstance(value, bool):
                 words.append(str(value))
-    return shlex.join(words)
+    return in_utf8(shlex.join(words))
 
 
-def commit_of(script: str) -> str:
-    """Returns the commit of this checkout; `-dirty` if it has changes, or does not hold the script."""
-    here = os.path.dirname(os.path.abspath(__file__))
+def commit_of(script: str, checkout: str | None = None) -> str:
+    """Returns the commit of this checkout, or of another; `-dirty` if it has changes, or does not hold the script."""
+    here = checkout or os.path.dirname(os.path.abspath(__file__))
     clean = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # of another repository
 
     def git(*words: str) -> subprocess.CompletedProcess:
-        return subprocess.run(["git", "-C", here, *words], capture_output=True, text=True, env=clean)
+        texts = {"encoding": "utf-8", "errors": "replace"}
+        return subprocess.run(["git", "-C", here, *words], capture_output=True, env=clean, **texts)
+
+    def holds(path: str) -> bool:
+        return git("ls-files", "--error-unmatch", os.path.abspath(path)).returncode == 0
 
     try:  # --exclude: the hash, not a tag
         described = git("describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
-        holds = git("ls-files", "--error-unmatch", os.path.abspath(script)).returncode == 0
+        own, script_in_it = checkout is not None or holds(__file__), holds(script)
     except OSError as error:
         return f"unknown ({error})"
     if described.returncode != 0:
         return f"unknown ({' '.join(described.stderr.split())})"
+    if not own:  # a copy inside a repository of something else
+        return f"unknown (the repository around {here} does not hold it)"
     commit = described.stdout.strip()
-    return commit if holds or commit.endswith("-dirty") else f"{commit}-dirty"
+    return commit if script_in_it or commit.endswith("-dirty") else f"{commit}-dirty"
 
 
 def provenance(script: str) -> dict[str, object]:
@@ -633,7 +670,9 @@ def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSi
         try:
             with contextlib.closing(make_envs(args.env_id, 1, args.threads, video=path + ".webm")) as envs:
                 scores = [score for score, _ in play(policy, envs, 1, [args.seed, 2], stop)]
-            if stop is None or not stop.number:
+            if stop is not None and stop.number:
+                run.films_cut_short += 1
+            else:
                 result = f"score_{scores[0]:.10g}" if scores else "without_end"
                 os.replace(path + ".webm", f"{path}_{result}.webm")
         finally:
@@ -715,6 +754,7 @@ def finished_text(args, run: RunDirectory, state: dict) -> str:
 
 def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
     """Ends a call whose agent is trained or loaded: evaluates it, or says how to go on. Exits with its status."""
+    run.trains = False
     path, step = os.path.abspath(run.path), run.iteration * args.batch_size
     done = args.evaluate is not None or run.iteration >= args.last_iteration
     wanted = args.evaluate is not None or (run.iteration == args.num_iterations and args.eval_episodes > 0)
@@ -729,6 +769,9 @@ def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: Stop
         say(f"Stopped; go on with: {call_of(args, '--resume', path, *stop_at)}")
     elif wanted and not evaluated:
         say(f"Not evaluated; do that with: {call_of(args, '--evaluate', path)}")
+    elif run.films_cut_short:
+        say(f"Not filmed; do that with: {call_of(args, '--evaluate', path, '--capture-video')}")
     elif done and not wanted and run.iteration < args.num_iterations:
         say(f"At --stop-at; go on with: {call_of(args, '--resume', path)}")
-    sys.exit(128 + stop.number if stop.number and (wanted or not done) else 1 if run.not_written else 0)
+    cut_short = wanted or not done or run.films_cut_short
+    sys.exit(128 + stop.number if stop.number and cut_short else 1 if run.not_written else 0)

@@ -26,13 +26,13 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Space, Tuple, flatdim
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.wrappers import (
-    DtypeObservation,
     FlattenObservation,
     FrameStackObservation,
     GrayscaleObservation,
     ReshapeObservation,
     ResizeObservation,
     TransformAction,
+    TransformObservation,
 )
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 
@@ -122,26 +122,31 @@ class WithoutInfo(gym.Wrapper):
         return (*self.env.step(action)[:4], {})
 
 
-class FiniteObservations(VectorWrapper):
-    """Raises FloatingPointError at an observation that is not finite, which no network can take."""
+class FiniteNumbers(VectorWrapper):
+    """Raises FloatingPointError at an observation or a reward that is not finite in float32: nothing learns from it."""
 
     def reset(self, **given):
         obs, infos = self.env.reset(**given)
         self.num_steps = 0
-        return self.checked(obs), infos
+        self.check("observation", obs)
+        return obs, infos
 
     def step(self, actions: np.ndarray):
-        obs, *rest = self.env.step(actions)
+        obs, rewards, terminations, truncations, infos = self.env.step(actions)
         self.num_steps += 1
-        return (self.checked(obs), *rest)
+        self.check("observation", obs)
+        self.check("reward", to_float32(rewards))
+        for number in np.flatnonzero(infos.get("_final_obs", False)):
+            self.check("last observation", infos["final_obs"][number][None], number)
+        return obs, rewards, terminations, truncations, infos
 
-    def checked(self, obs: np.ndarray) -> np.ndarray:
-        if not (finite := np.isfinite(obs).all(axis=1)).all():
-            number = np.flatnonzero(~finite)[0]
-            raise FloatingPointError(
-                f"the observation of environment {number} is not finite after {self.num_steps} steps"
-            )
-        return obs
+    def check(self, what: str, numbers: np.ndarray, first: int = 0) -> None:
+        """Checks an array that has an environment in each row, from environment `first` on."""
+        if numbers.dtype == np.uint8:  # screens
+            return
+        if not (finite := np.isfinite(numbers).reshape(len(numbers), -1).all(axis=1)).all():
+            number = first + np.flatnonzero(~finite)[0]
+            raise FloatingPointError(f"the {what} of environment {number} is not finite after {self.num_steps} steps")
 
 
 class RecordVideo(VectorWrapper):
@@ -158,10 +163,10 @@ class RecordVideo(VectorWrapper):
     def reset(self, *, seed=None, options=None):
         """Begins the file anew. Raises OSError if it cannot be written."""
         obs, infos = self.env.reset(seed=seed, options=options)
-        screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed)[0][0, 0]
+        screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed, options=options)[0][0, 0]
         import cv2  # here, because it changes the environment variables of whoever imports it
 
-        self.screens = 0  # written
+        self.screens, self.shape = 0, screen.shape  # written
         with silent():  # about a tag that WebM does without
             vp9 = cv2.VideoWriter_fourcc(*"VP90")
             self.video = cv2.VideoWriter(self.path, cv2.CAP_FFMPEG, vp9, self.fps, screen.shape[1::-1])
@@ -184,6 +189,8 @@ class RecordVideo(VectorWrapper):
 
     def write(self, screen: np.ndarray) -> None:
         if self.video is not None:
+            if np.shape(screen) != self.shape or screen.dtype != np.uint8:  # OpenCV would leave it out
+                raise OSError(f"picture {self.screens} is not one of {self.shape} in uint8 as the first")
             self.screens += 1
             self.video.write(np.ascontiguousarray(screen[..., ::-1]))  # OpenCV takes blue first
 
@@ -328,22 +335,31 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
                 **({} if video is None else {"render_mode": "rgb_array"}),
             )
             envs.reset()  # an environment that cannot start is refused here, too
-            if video is not None and np.shape(screen := envs.render()[0])[2:] != (3,):
-                shown = "nothing" if screen is None else f"arrays of shape {np.shape(screen)}"
-                raise ValueError(f"no video can be made of it, it renders {shown}, not (height, width, 3)")
+            if video is not None and (shown := unfit_for_video(envs)):
+                raise ValueError(f"no video can be made of it, it renders {shown}")
     except gym.error.UnregisteredEnv as error:
         raise ValueError(suggest(prefix, name)) from error
     except Refused:
         raise
-    except Exception as error:  # whatever a foreign constructor raises
+    except (Exception, SystemExit) as error:  # whatever a foreign constructor raises
         verb = "built" if video is None else "rendered"
         reason = str(error).replace("use `", f"use `{prefix}") or type(error).__name__  # Gymnasium, of another version
         raise ValueError(f"it cannot be {verb}: {reason}") from error
     if video is not None:
-        envs = RecordVideo(envs, video, envs.metadata.get("render_fps") or 30)
-    if len(envs.single_observation_space.shape) == 1:
-        envs = FiniteObservations(envs)
-    return RecordEpisodeStatistics(envs)
+        envs = RecordVideo(envs, video, float(envs.metadata.get("render_fps") or 30))
+    return RecordEpisodeStatistics(FiniteNumbers(envs))
+
+
+def unfit_for_video(envs: VectorEnv) -> str:
+    """Says what environments render, if that cannot be filmed."""
+    screen, fps = envs.render()[0], envs.metadata.get("render_fps")
+    if not isinstance(screen, np.ndarray):
+        return f"{type(screen).__name__}, not an array"
+    if screen.dtype != np.uint8 or screen.ndim != 3 or screen.shape[2] != 3 or min(screen.shape) < 2:
+        return f"{screen.dtype} of shape {screen.shape}, not (height, width, 3) in uint8"
+    if not isinstance(fps, int | float | None) or (fps is not None and not 0 < fps < 1000):
+        return f"{fps!r} pictures a second, not a number"
+    return ""
 
 
 class Refused(ValueError):
@@ -357,7 +373,7 @@ def import_registrations(module: str, name: str) -> None:
             sys.path.append(os.getcwd())  # last, so that nothing in it hides a package
         try:
             importlib.import_module(module)
-        except Exception as error:  # whatever a foreign module raises
+        except (Exception, SystemExit) as error:  # whatever a foreign module raises
             raise Refused(f"module {module} cannot be imported ({error!r}); install it or start beside it") from error
     if name not in gym.registry:
         for call in importlib.metadata.entry_points(group="gymnasium.envs"):  # which Gymnasium made until 1.0
@@ -400,11 +416,18 @@ def preprocess(env: gym.Env) -> gym.Env:
             raise Refused(f"its {' and '.join(refused)}, not numbers; register it with a wrapper that leaves this out")
         if flatdim(obs_space) == 0:
             raise Refused("its observations are empty")
-        return DtypeObservation(FlattenObservation(env), np.float32)
+        flat = Box(-np.inf, np.inf, (flatdim(obs_space),), np.float32)
+        return TransformObservation(FlattenObservation(env), to_float32, flat)
     if len(shape) == 3:
         env = GrayscaleObservation(env) if shape[-1] == 3 else ReshapeObservation(env, shape[:2])
     env = ResizeObservation(env, SCREEN)  # before the stack: one screen is resized, not four
     return FrameStackObservation(env, STACK)
+
+
+def to_float32(numbers: np.ndarray) -> np.ndarray:
+    """Rounds to float32; numbers beyond it become infinite, and are refused by `FiniteNumbers`."""
+    with np.errstate(over="ignore"):
+        return np.asarray(numbers, np.float32)
 
 
 def unsupported_parts(space: Space, path: str = "observations") -> Iterator[str]:

@@ -1,8 +1,10 @@
 """The scripts as a user runs them: smoke runs as processes, their curves, and refusals of bad input."""
 
 import contextlib
+import inspect
 import json
 import math
+import os
 import re
 import shlex
 import signal
@@ -145,6 +147,44 @@ def test_bfloat16_that_would_be_emulated_is_warned_of_once(flags, kind, lines, m
     assert ended.status == 0 and ended.err.count("\n") == ended.err.count("has no bfloat16 instructions") == lines
 
 
+def test_a_closed_stream_gives_its_number_to_no_file():
+    """A result would be written into it: as after `<&- >&- 2>&-`, the numbers 0 to 2 are free."""
+    probe = """
+import os, sys
+os.closerange(0, 3)
+sys.stdout = sys.stderr = None
+sys.argv = ["probe"]
+import bookkeeping
+bookkeeping.parse(int, default=0)
+os._exit(os.open("/dev/null", os.O_RDONLY))
+"""
+    assert subprocess.run([sys.executable, "-c", probe], cwd=ROOT, timeout=PATIENCE).returncode > 2
+
+
+@pytest.mark.parametrize(("words", "status"), [(["--help"], 0), (["--gamma", "much"], 2)])
+def test_help_that_nobody_reads_is_no_failure_and_bad_input_always_is_one(words, status, monkeypatch):
+    def print_to_a_full_disk(*given, **options):
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr(tyro, "cli", print_to_a_full_disk)
+    monkeypatch.setattr(sys, "argv", ["ppo_atari.py", *words])
+    kept = os.dup(1)
+    try:
+        with pytest.raises(SystemExit) as ended:
+            bookkeeping.parse(acppo_atari.Args)
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+    assert (ended.value.code or 0) == status
+
+
+def test_a_script_whose_name_is_not_utf8_is_recorded_with_a_mark(monkeypatch):
+    monkeypatch.setattr(inspect, "getfile", lambda args_class: "/there/my\udcff.py")
+    assert command_line(acppo_atari.Args(threads=1)).split()[1].strip("'") == "my\ufffd.py"
+    # In an ASCII locale Python reads all bytes beyond as such halves; UTF-8 among them is what it is
+    assert bookkeeping.in_utf8("r\udcc3\udcbc") == "r\u00fc"
+
+
 @pytest.mark.parametrize(("file", "name"), [("a/my ppo (2).py", "my-ppo--2-"), ("ppo_atari.py", "ppo_atari")])
 def test_a_script_s_runs_are_named_after_its_file(file, name):
     assert file_name(file) == name
@@ -157,6 +197,15 @@ def test_the_commit_is_this_checkout_s_and_dirty_for_a_script_that_it_does_not_h
     if not commit.startswith("unknown ("):
         (tmp_path / "my_ppo.py").write_text("")
         assert commit_of(str(tmp_path / "my_ppo.py")) == commit.removesuffix("-dirty") + "-dirty"
+    another = tmp_path / "another"
+    outside = {name: value for name, value in environment().items() if not name.startswith("GIT_")}
+    subprocess.run(["git", "init", "-q", another], env=outside, check=True)
+    assert commit_of(acppo_atari.__file__, str(another)).startswith("unknown (")  # it has no commit
+    commit_it = ["-c", "user.name=a", "-c", "user.email=b", "commit", "-q", "--allow-empty", "-m", "one"]
+    subprocess.run(["git", "-C", another, *commit_it], env=outside, check=True)
+    assert re.fullmatch(r"[0-9a-f]{40}-dirty", commit_of(acppo_atari.__file__, str(another)))
+    monkeypatch.setattr(bookkeeping, "__file__", str(another / "bookkeeping.py"))  # a copy that it does not hold
+    assert "does not hold it" in commit_of(acppo_atari.__file__)
     monkeypatch.setenv("PATH", str(tmp_path))
     assert commit_of(acppo_atari.__file__).startswith("unknown (")  # git is not installed
 
@@ -178,7 +227,11 @@ REFUSED = [
     (["--env-id", "Pendulum-v1"], "--env-id Pendulum-v1", "only Discrete actions"),
     (["--gamma", "1.01"], "--gamma 1.01", "from 0 to 1"),
     (["--log-dir", "taken"], "--log-dir taken", "cannot be written"),
-    (["--log-dir", "r\udcff"], "--log-dir r?", "give it in UTF-8"),  # a byte that is no UTF-8, as Python decodes it
+    (
+        ["--log-dir", "r\udcff"],
+        "--log-dir r\ufffd",
+        "give it in UTF-8",
+    ),  # as Python decodes a byte
 ]
 
 
@@ -275,7 +328,7 @@ def test_ctrl_c_during_the_imports_ends_without_a_traceback(script, tmp_path):
     command = [sys.executable, script.__file__]
     interrupted = environment(tmp_path)
     ended = subprocess.run(command, env=interrupted, capture_output=True, text=True, timeout=PATIENCE, **restore)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (-signal.SIGINT, "", "")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, "", "")
 
 
 def test_nothing_that_only_posix_has_is_needed_to_import_and_train(tmp_path):

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -19,7 +20,7 @@ from gymnasium.vector import VectorWrapper
 
 import bookkeeping
 import tiny_envs
-from bookkeeping import play, record_game
+from bookkeeping import finish, play, record_game
 from conftest import (
     PATIENCE,
     SHORT_CARTPOLE,
@@ -215,7 +216,7 @@ def test_a_signal_ends_an_evaluation_between_two_agent_steps(script, tmp_path, s
     assert checkpoint_of(run_dir)["global_step"] == 128 and not (run_dir / "eval.csv").exists()
 
 
-def test_a_film_that_a_signal_cuts_short_leaves_no_file(script, tmp_path):
+def test_a_film_that_a_signal_cuts_short_leaves_no_file_and_is_told(script, tmp_path, capfd):
     args, stop = script.Args(env_id=RENDERED, threads=1), bookkeeping.StopSignal()
     policy, steps = policy_for(script, RENDERED), []
 
@@ -227,6 +228,11 @@ def test_a_film_that_a_signal_cuts_short_leaves_no_file(script, tmp_path):
     with open_run(script, tmp_path) as run:
         record_game(args, policy_until_signal, run, step=7, stop=stop)
         assert len(steps) == 5 and not run.not_written
+        run.iteration = 1
+        with pytest.raises(SystemExit) as ended:  # of a finished training that is not to be evaluated
+            finish(replace(args, total_timesteps=1024, eval_episodes=0), None, run, stop)
+    assert ended.value.code == 128 + signal.SIGTERM
+    assert capfd.readouterr().err.endswith(f"--evaluate {tmp_path} --capture-video\n")
     assert list(tmp_path.glob("videos/*")) == []
 
 
@@ -241,6 +247,7 @@ def recorded(script, run_dir, env_id: str) -> bool:
     """Has a game recorded into a run's directory; returns whether all could be written."""
     args = script.Args(env_id=env_id, threads=1)
     with open_run(script, run_dir) as run:
+        run.trains = True
         record_game(args, policy_for(script, env_id), run, step=7)
         return not run.not_written
 
@@ -311,18 +318,15 @@ def test_a_log_file_gets_a_line_a_minute_and_a_terminal_one_line(script, monkeyp
         "step 1,800 of 2,000, 50 SPS, score 1.5, 0:00:04 left\n"
     )
     monkeypatch.setattr(os, "isatty", lambda descriptor: True)
-    monkeypatch.setenv("COLUMNS", "45")
+    monkeypatch.setattr(os, "get_terminal_size", lambda descriptor: os.terminal_size((45, 24)))  # standard error's
     line.show(args, 19, sps=50.0, last_scores=[])
     line.show(args, 20, sps=50.0, last_scores=[])
     clear = "\r\x1b[K"
     shown = f"{clear}step 1,900 of 2,000, 50 SPS, 0:00:02 left{clear}step 2,000 of 2,000, 50 SPS, 0:00:00 left\n"
     assert capfd.readouterr().err == shown
-    monkeypatch.setenv("COLUMNS", "20")
+    monkeypatch.setattr(os, "get_terminal_size", lambda descriptor: os.terminal_size((20, 24)))
     line.show(args, 19, sps=50.0, last_scores=[])
     assert capfd.readouterr().err == f"{clear}step 1,900 of 2,000"
-    monkeypatch.setattr(sys, "stderr", None)  # as Python leaves it if the shell closed it: 2>&-
-    line.show(args, 20, sps=50.0, last_scores=[])
-    assert capfd.readouterr().err == ""
 
 
 def test_a_game_of_an_evaluation_is_the_same_however_many_are_played(script, tmp_path, call_main):

@@ -1,5 +1,6 @@
 """A run is never lost: checkpoints, resuming, signals, and faults that are provoked for real."""
 
+import errno
 import json
 import math
 import os
@@ -9,11 +10,13 @@ import resource
 import shlex
 import shutil
 import signal
+import stat
 import sys
 import time
 from collections import Counter
 from pathlib import Path
 
+import filelock
 import pytest
 import torch
 from hypothesis import HealthCheck, given, settings
@@ -225,10 +228,17 @@ def test_a_run_is_found_by_its_checkpoint_and_named_if_its_parent_is_given(scrip
     assert f"not evaluated, do that with: {shlex.join(command)}" in out
     said = f"--resume {tmp_path}: it holds no checkpoint; give a run in it: finished\n"
     assert call_main(script, "--resume", str(tmp_path)) == (2, "", said)
+    finished.rename(tmp_path.joinpath("runs").mkdir() or tmp_path / "runs" / "finished")
+    said = said.replace("finished", "runs/finished")
+    assert call_main(script, "--resume", str(tmp_path)) == (2, "", said)
 
 
-def test_a_run_that_cannot_be_written_is_refused_unless_it_is_only_played(script, finished, monkeypatch, call_main):
-    monkeypatch.setattr(os, "access", lambda path, mode: False)
+@pytest.mark.parametrize("name", ["finished", "run.lock"])  # the latter, if another user has played it
+def test_a_run_that_cannot_be_written_is_refused_unless_it_is_only_played(
+    script, finished, name, monkeypatch, call_main
+):
+    (finished / "run.lock").touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: os.path.basename(path) != name)
     assert call_main(script, "--resume", "finished") == (2, "", "--resume finished: it cannot be written\n")
     assert call_main(script, "--evaluate", "finished", "--eval-episodes", "1").status == 0
 
@@ -299,6 +309,34 @@ def test_two_processes_cannot_hold_one_run(script, finished, call_main):
         refusal = "--resume finished: another process holds it; wait for its end\n"
         assert call_main(script, *flags) == (2, "", refusal)
     assert call_main(script, *flags).status == 0
+
+
+def test_a_directory_that_cannot_be_locked_is_not_left_behind(script, tmp_path, monkeypatch, call_main):
+    def make_the_file_and_fail(lock, blocking):
+        Path(lock.lock_file).touch()
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", make_the_file_and_fail)
+    status, out, said = call_main(script, *flags_of(**CARTPOLE, total_timesteps=128))
+    assert (status, out) == (2, "") and "cannot be written (No locks available)" in said
+    assert list((tmp_path / "runs").iterdir()) == []
+
+
+def test_a_file_system_that_cannot_sync_a_directory_costs_no_open_files(script, tmp_path, monkeypatch):
+    fsync = os.fsync
+
+    def fsync_files_alone(descriptor):
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(errno.EINVAL, "Invalid argument")
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync_files_alone)
+    with open_run(script, tmp_path) as run:
+        os.close(before := os.dup(2))
+        for _ in range(3):
+            run.write({"iteration": 1})
+        os.close(after := os.dup(2))  # the lowest number that is free
+        assert before == after and not run.not_written
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, pytest.param(signal.SIGINT, marks=pytest.mark.slow)])

@@ -1,6 +1,7 @@
 """The environments: real games step by step against a reference, names, seeds, and what is refused."""
 
 import importlib.metadata
+import itertools
 import math
 import sys
 
@@ -324,8 +325,9 @@ class OwnInfos(gym.Env):
     observation_space, action_space = Box(-math.inf, math.inf, (1,), np.float64), Discrete(2)
     metadata = {"render_modes": ["rgb_array"], "render_fps": None}
 
-    def __init__(self, render_mode: str | None = None, observation=0.0, screen=None):
-        self.render_mode, self.observation, self.screen = render_mode, observation, screen
+    def __init__(self, render_mode: str | None = None, observation=0.0, reward=1.0, at=7, screens=()):
+        self.render_mode, self.observation, self.reward, self.at = render_mode, observation, reward, at
+        self.screens = itertools.chain(screens, itertools.repeat(screens[-1] if screens else None))
 
     def infos(self) -> dict:
         return {"episode": {"r": 0.0, "l": 0}, "_episode": 3, "final_obs": "none", "lives": 2}
@@ -337,17 +339,17 @@ class OwnInfos(gym.Env):
 
     def step(self, action):
         self.steps += 1
-        observation = np.array([self.observation if self.steps == 7 else 0.0])
-        return observation, 1.0, self.steps == 10, False, self.infos()
+        observation = np.array([self.observation if self.steps == self.at else 0.0])
+        return observation, self.reward if self.steps == self.at else 1.0, self.steps == 10, False, self.infos()
 
     def render(self):
-        return self.screen
+        return next(self.screens)
 
 
 @pytest.fixture
 def own_infos():
     gym.register("OwnInfos-v0", OwnInfos)
-    yield lambda **given: gym.registry["OwnInfos-v0"].kwargs.update(given)
+    yield gym.registry["OwnInfos-v0"]
     del gym.registry["OwnInfos-v0"]
 
 
@@ -359,24 +361,56 @@ def test_only_the_scores_that_the_wrappers_measure_count(own_infos):
     assert infos[-1]["episode"]["r"].tolist() == [10, 10] and infos[-1]["_episode"].all()
 
 
-@pytest.mark.filterwarnings("ignore:overflow")
-@pytest.mark.parametrize("observation", [math.nan, math.inf, 1e300])  # the last is finite in float64 alone
-def test_an_observation_that_is_not_finite_is_told_by_environment_and_step(own_infos, observation):
-    own_infos(observation=observation)
+@pytest.mark.parametrize("number", [math.nan, math.inf, 1e300])  # the last is finite in float64 alone
+@pytest.mark.parametrize(("given", "at"), [("observation", 7), ("reward", 7), ("observation", 10)])
+@pytest.mark.filterwarnings("error")
+def test_a_number_that_is_not_finite_is_told_by_environment_and_step(own_infos, number, given, at):
+    """In an observation, also the last of a game, and in a reward."""
+    own_infos.kwargs |= {given: number, "at": at}
     envs = make_envs("OwnInfos-v0", 2)
     envs.reset(seed=[1, 2])
-    with pytest.raises(FloatingPointError, match="environment 0 is not finite after 7 steps"):
-        for _ in range(7):
+    with pytest.raises(FloatingPointError, match=f"{given} of environment 0 is not finite after {at} steps"):
+        for _ in range(at):
             envs.step(np.array([0, 1]))
 
 
-@pytest.mark.parametrize("shape", [(8, 8), (8, 8, 4)])
-def test_pictures_that_no_video_can_show_are_refused(own_infos, shape, tmp_path):
-    own_infos(screen=np.zeros(shape, np.uint8))
-    with pytest.raises(ValueError, match="not \\(height, width, 3\\)"):
+@pytest.mark.parametrize(
+    "screen",
+    [np.zeros((8, 8), np.uint8), np.zeros((8, 8, 4), np.uint8), np.zeros((8, 8, 3)), np.zeros((1, 1, 3), np.uint8)]
+    + [[[[0, 0, 0]] * 8] * 8, None],
+    ids=lambda screen: f"{getattr(screen, 'dtype', type(screen).__name__)} {np.shape(screen)}",
+)
+def test_pictures_that_no_video_can_show_are_refused(own_infos, screen, tmp_path):
+    own_infos.kwargs["screens"] = [screen]
+    with pytest.raises(ValueError, match="no video can be made of it, it renders .*, not "):
         make_envs("OwnInfos-v0", 1, video=str(tmp_path / "none.webm"))
-    own_infos(screen=np.zeros((8, 8, 3), np.uint8))
-    assert make_envs("OwnInfos-v0", 1, video=str(tmp_path / "none.webm")).env.env.fps == 30  # metadata says None
+
+
+def test_pictures_are_shown_at_their_speed_which_may_be_missing_but_must_be_a_number(own_infos, monkeypatch):
+    own_infos.kwargs["screens"] = [np.zeros((8, 8, 3), np.uint8)]
+    assert make_envs("OwnInfos-v0", 1, video="none.webm").env.env.fps == 30  # metadata says None
+    monkeypatch.setitem(OwnInfos.metadata, "render_fps", "30")
+    with pytest.raises(ValueError, match="'30' pictures a second, not a number"):
+        make_envs("OwnInfos-v0", 1, video="none.webm")
+
+
+@pytest.mark.parametrize("other", [np.zeros((9, 8, 3), np.uint8), np.zeros((8, 8, 3))], ids=["larger", "float"])
+def test_a_picture_unlike_the_first_ends_the_film_with_its_number(own_infos, other, tmp_path):
+    first = np.zeros((8, 8, 3), np.uint8)
+    own_infos.kwargs["screens"] = [first, first, first, other]  # one to look at, then those of the film
+    envs = make_envs("OwnInfos-v0", 1, video=str(tmp_path / "film.webm"))
+    envs.reset(seed=[1])
+    envs.step(np.array([0]))
+    with pytest.raises(OSError, match="picture 2 is not"):
+        envs.step(np.array([0]))
+
+
+@pytest.mark.parametrize("leaves", ["import sys; sys.exit('no licence')", "raise RuntimeError('no licence')"])
+def test_a_module_that_ends_the_program_is_refused_as_one_that_fails(leaves, tmp_path, monkeypatch):
+    (tmp_path / "leaves_at_once.py").write_text(leaves)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match="module leaves_at_once cannot be imported .*no licence"):
+        make_envs("leaves_at_once:X-v0", 1)
 
 
 def test_a_reset_of_some_games_presses_fire_in_those_alone():

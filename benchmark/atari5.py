@@ -16,7 +16,6 @@ own directories, OUT/logs what each of them was started with and has printed. Ex
 
 import contextlib
 import ctypes
-import fcntl
 import hashlib
 import importlib.util
 import io
@@ -274,6 +273,8 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
     The lock on the log keeps two processes off one run. It belongs to the open file, which the script inherits as its
     output: it lasts until the task and the script are gone, whichever of them lives longer.
     """
+    import fcntl  # POSIX alone has it, and the rest of this file does without
+
     # Ray's cancel interrupts by this signal, which a worker ignores if the driver does, as under `nohup … &`
     signal.signal(signal.SIGINT, signal.default_int_handler)
     # Ray sets this for its workers; a run shall see the same as without Ray
@@ -304,12 +305,12 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
 
 def run_process(command: list[str], environment: dict[str, str], log) -> int:
     """Runs a process that does not outlive this one, and returns its exit status."""
-    worker, libc = os.getpid(), ctypes.CDLL(None)
+    worker, libc = os.getpid(), ctypes.CDLL(None) if sys.platform == "linux" else None
 
     def die_with_worker() -> None:
         # For a worker that is killed: one that ends by itself kills its children. SIGTERM has the script write a
         # checkpoint, and the lock has the next attempt wait for it. 1 is PR_SET_PDEATHSIG, which Linux alone has.
-        if hasattr(libc, "prctl"):
+        if libc is not None:
             libc.prctl(1, signal.SIGTERM)
         if os.getppid() != worker:  # it died before the line above
             os._exit(1)

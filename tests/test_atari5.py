@@ -19,7 +19,7 @@ import torch
 import bookkeeping
 from benchmark import atari5
 from benchmark.atari5 import Args, Progress
-from conftest import ROOT, SCRIPTS, scalars
+from conftest import PATIENCE, ROOT, SCRIPTS, environment, scalars
 
 ENDLESS = 10**9  # agent steps: no run ends before its test lets it
 GUARD = 300  # seconds, after which something hangs; no outcome depends on it
@@ -296,6 +296,29 @@ def test_a_run_goes_on_with_the_arithmetic_that_it_began_with(tmp_path):
 def test_what_cannot_work_is_refused_in_one_line(flags, call):
     status, _, said = call(*flags)
     assert status == 2 and said.count("\n") == 1 and said.startswith(flags[0])
+
+
+def test_nothing_that_only_posix_has_is_needed_to_import_a_program(tmp_path):
+    """What another system lacks is taken away: modules, signals, functions of `os`, and the process as a library."""
+    probe = """
+import ctypes, importlib, os, pathlib, signal, sys
+import ale_py, gymnasium, matplotlib.figure, pandas, tensorboard.backend.event_processing.event_accumulator, torch
+sys.modules |= dict.fromkeys(("fcntl", "resource", "pwd", "grp", "termios"))
+for module, names in ((os, "sched_getaffinity getuid fchmod wait4 getpgid killpg setsid"), (signal, "SIGHUP")):
+    for name in names.split():
+        delattr(module, name)
+ctypes.CDLL = None
+for path in pathlib.Path(sys.argv[1]).glob("*.py"):
+    try:
+        importlib.import_module(f"benchmark.{path.stem}")
+    except ModuleNotFoundError as error:
+        if error.name != "stable_baselines3":
+            raise
+    print(path.stem)
+"""
+    command = [sys.executable, "-c", probe, str(ROOT / "benchmark")]
+    ended = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=PATIENCE)
+    assert ended.returncode == 0 and "atari5" in ended.stdout.split(), ended.stderr
 
 
 @pytest.mark.parametrize(

@@ -390,16 +390,18 @@ class Progress:
         self.due = time.monotonic() + 60
 
     def show(self) -> None:
-        if not sys.stderr.isatty() and time.monotonic() < self.due:
+        if not (terminal := os.isatty(2)) and time.monotonic() < self.due:
             return
-        self.due = time.monotonic() + 60
-        header, *rows = self.table()
-        if sys.stderr.isatty():
+        self.due, table = time.monotonic() + 60, self.table()
+        if terminal:
             back = f"\x1b[{self.drawn}F\x1b[J" if self.drawn else ""  # up to the table's first line, and clear
-            say(back + "\n".join([header, *rows]))
-            self.drawn = 1 + len(rows)
+            with contextlib.suppress(OSError):  # lines that wrap or scroll away cannot be written over
+                columns, lines = os.get_terminal_size(2)  # 0 if it does not tell
+                table = [line[: (columns or 80) - 1] for line in table[: (lines or 24) - 1]]
+            say(back + "\n".join(table))
+            self.drawn = len(table)
         else:
-            say("; ".join([header, *(" ".join(row.split()) for row in rows)]))
+            say("; ".join(" ".join(line.split()) for line in table))
 
     def table(self) -> list[str]:
         """Returns a line on the grid, and one for each run that is running or has failed."""

@@ -383,6 +383,31 @@ def test_the_table_shows_percent_score_and_time_left_from_the_logs(tmp_path):
     assert " ".join(Progress(runs, args).table()[1].split()) == "Phoenix ppo seed 1 0%"
 
 
+@pytest.mark.parametrize("size", [(40, 24), (200, 3), (0, 0), None], ids=str)
+def test_the_table_in_a_terminal_is_no_larger_than_that_and_is_written_over(size, tmp_path, monkeypatch):
+    def size_of(descriptor: int) -> os.terminal_size:
+        if size is None:
+            raise OSError("not a terminal")
+        assert descriptor == 2
+        return os.terminal_size(size)
+
+    said = []
+    monkeypatch.setattr(os, "isatty", lambda descriptor: True)
+    monkeypatch.setattr(os, "get_terminal_size", size_of)
+    monkeypatch.setattr(atari5, "say", said.append)
+    runs = [make_run("SpaceInvaders", "acppo-eps0.08") for _ in range(3)]
+    for run in runs:
+        run.state = "failed"
+    progress = Progress(runs, Args(out=tmp_path))
+    progress.show()
+    progress.show()
+    whole, table = progress.table(), said[0].split("\n")
+    assert max(map(len, whole)) > 40 and len(whole) == 4
+    columns, lines = size if size and size[0] else (80, 24)
+    assert table == [line[: columns - 1] for line in whole[: lines - 1]]
+    assert said[1] == f"\x1b[{len(table)}F\x1b[J{said[0]}"  # the cursor stands on the line below the table
+
+
 # ------------------------------------------------------------------------------------ workers and nodes that are killed
 def wait_for_second_start(out: Path, name: str) -> Path:
     """Waits until a second process of a run has finished an iteration; returns the run's directory."""

@@ -38,7 +38,7 @@ from pathlib import Path
 from types import ModuleType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import RETIRED, available_cores, parse, refuse, say, tell
+from bookkeeping import RETIRED, StopSignal, available_cores, parse, refuse, say, tell
 from bookkeeping import check as check_bounds
 
 SCRIPTS = Path(__file__).resolve().parent.parent
@@ -331,6 +331,15 @@ def run_process(command: list[str], environment: dict[str, str], log) -> int:
 
 
 # ----------------------------------------------------------------------------------------------------- the driver
+class Interrupt(StopSignal):
+    """Raises KeyboardInterrupt at a signal, and again at one that comes a second or more after it."""
+
+    def note(self, number: int, frame: object) -> None:
+        if not self.number or time.monotonic() - self.since >= 1:
+            self.number, self.since = number, time.monotonic()
+            raise KeyboardInterrupt
+
+
 def run_grid(runs: list[Run], args: Args) -> None:
     """Takes the queued runs to `done` or `failed`. Raises KeyboardInterrupt when interrupted, with all runs stopped."""
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
@@ -344,12 +353,11 @@ def run_grid(runs: list[Run], args: Args) -> None:
     try:
         try:
             ray.init(args.address or "local", **quiet, **({} if args.address else cores))
-        except (OSError, ValueError, RuntimeError) as error:
+        except Exception as error:  # Ray raises bare ones, too
+            reason = (str(error) or repr(error)).splitlines()[0]
             advice = "" if args.address else "; set RAY_TMPDIR or TMPDIR to a short path that can be written"
-            refuse(f"--address {args.address or 'local'}", f"Ray does not start ({str(error).splitlines()[0]}){advice}")
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):  # after init, which sets the second
-            if signal.getsignal(number) != signal.SIG_IGN:  # as nohup sets the third
-                signal.signal(number, signal.default_int_handler)
+            refuse(f"--address {args.address or 'local'}", f"Ray does not start ({reason}){advice}")
+        Interrupt().listen()  # after init, which has a handler for SIGTERM
         most = max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])
         if args.cpus_per_run > most:
             refuse(f"--cpus-per-run {args.cpus_per_run}", f"no node has more than {most:.0f}")
@@ -372,7 +380,7 @@ def run_grid(runs: list[Run], args: Args) -> None:
     except KeyboardInterrupt:
         # Each task is told and awaited, because Ray kills the children of a worker that it shuts down with SIGKILL
         if pending:
-            say("\nStopping: each run finishes its iteration and writes a checkpoint; once more ends at once")
+            say("\nStopping: each run writes a checkpoint; another signal, at least a second from now, ends at once")
             for ref in pending:
                 ray.cancel(ref)
             ray.wait(list(pending), num_returns=len(pending))

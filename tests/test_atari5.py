@@ -355,6 +355,38 @@ def test_a_grid_takes_the_cores_that_it_is_given(tmp_path, call, monkeypatch):
     assert f"asked for {len(os.sched_getaffinity(0))})" in call(*flags)[2]
 
 
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(Exception("node timed out\nand 19 lines"), "node timed out"), (OSError("AF_UNIX path"), "AF_UNIX path")]
+    + [(TimeoutError(), "TimeoutError()")],
+)
+def test_a_ray_that_does_not_start_is_reported_in_one_line(error, reason, tmp_path, call, monkeypatch):
+    import ray
+
+    def refuse_to_start(*_, **__):
+        raise error
+
+    monkeypatch.setattr(ray, "init", refuse_to_start)
+    status, _, said = call("--games", "Qbert", "--out", str(tmp_path))
+    assert status == 2 and said.count("\n") == 1 and f"Ray does not start ({reason}); set RAY_TMPDIR" in said
+
+
+def test_a_second_signal_interrupts_only_from_one_second_on(monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    interrupt = atari5.Interrupt()
+
+    def interrupts(seconds: float) -> bool:
+        clock[0] = 100 + seconds
+        try:
+            interrupt.note(signal.SIGTERM, None)
+        except KeyboardInterrupt:
+            return True
+        return False
+
+    assert [interrupts(seconds) for seconds in (0, 0.003, 0.9, 1, 1.5)] == [True, False, False, True, False]
+
+
 def test_an_interrupted_directory_without_a_checkpoint_does_not_count(tmp_path):
     (tmp_path / "runs" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
     run = make_run("Qbert", "ppo")

@@ -179,8 +179,11 @@ def read_variant(word: str, total_timesteps: int) -> Variant:
         kind, said = type(error).__name__, re.sub("[│╭╮╰╯]", "", said.getvalue())
         reason = re.split("[-─]{9,}", said)[1:2] or [f"{kind}: {error}"]
         refuse(given, f"{script} cannot be used ({reason[0].strip()})")
-    check_bounds(arguments)
-    return Variant(name, script, flags, text, vars(arguments))
+    try:
+        check_bounds(arguments)
+        return Variant(name, script, flags, text, vars(arguments))
+    except Exception as error:  # its Args may have no rules(), or rules that raise
+        refuse(given, f"{script} cannot be used ({type(error).__name__}: {error})")
 
 
 @dataclass

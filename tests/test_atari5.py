@@ -581,11 +581,18 @@ def my_ppo(tmp_path, monkeypatch) -> Path:
         (["ppo", "mine=ends.py"], "ends.py cannot be used (SystemExit"),
         (["ppo", "mine=other.py"], "other.py cannot be used (AttributeError"),
         (["ppo", "mine=foreign.py"], "foreign.py cannot be used (Unrecognized options: --exp-name"),
+        (["ppo", "mine=lawless.py"], "lawless.py cannot be used (AttributeError"),
+        (["ppo", "mine=odd.py"], "odd.py cannot be used (ZeroDivisionError"),
     ],
 )
 def test_a_variant_that_cannot_be_trained_is_refused_in_one_line(variants, said, my_ppo, call):
     texts = {"broken": "print(", "raises": "1 / 0", "ends": "raise SystemExit(3)", "other": "x = 1"}
     texts["foreign"] = "import dataclasses\n@dataclasses.dataclass\nclass Args:\n    total_timesteps: int = 1\n"
+    whole = my_ppo.read_text()
+    texts |= {
+        "lawless": whole.replace("def rules", "def of_another_name"),
+        "odd": whole + "\nArgs.rules = lambda _: 1 / 0",
+    }
     for name, text in texts.items():
         my_ppo.with_name(f"{name}.py").write_text(text)
     status, printed, err = call("--out", "out", "--dry-run", "--variants", *variants)

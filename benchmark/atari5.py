@@ -38,6 +38,7 @@ from pathlib import Path
 from types import ModuleType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
+from benchmark.arguments import parse_arguments
 from bookkeeping import RETIRED, StopSignal, available_cores, parse, refuse, say, tell
 from bookkeeping import check as check_bounds
 
@@ -298,7 +299,7 @@ def train(run: Run, args: Args, omp_num_threads: str | None) -> str:
             if Path(run.variant.script).read_bytes() != run.variant.text:
                 return f"{run.variant.script} has been edited since this call began; call again"
             command = run.command(args)  # now that the lock is held, and the checkpoint is whole
-            log.write(f"{datetime.now():%Y-%m-%d %H:%M:%S} {platform.node()}$ {shlex.join(command)}\n".encode())
+            log.write(os.fsencode(f"{datetime.now():%Y-%m-%d %H:%M:%S} {platform.node()}$ {shlex.join(command)}\n"))
             log.flush()
             if (status := run_process(command, environment, log)) == 0:
                 return ""
@@ -441,7 +442,7 @@ class Progress:
 
 
 def main() -> None:
-    args = parse(Args, description=__doc__)
+    args = parse_arguments(Args, __doc__)
     check(args)
     args.out = args.out.resolve()  # the tasks stand elsewhere
     try:

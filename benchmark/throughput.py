@@ -46,9 +46,10 @@ import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
+from benchmark.arguments import parse_arguments
 from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, in_own_process, measure_limits
 from benchmark.readme import markdown, write_part
-from bookkeeping import available_cores, kind_of_processor, parse, refuse, write_text
+from bookkeeping import available_cores, kind_of_processor, refuse, say, tell, write_text
 from wrappers import find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -397,7 +398,7 @@ def readme_table(directory: Path = RESULTS) -> str:
 
 # ------------------------------------------------------------------------------------------------- command line
 def main() -> None:
-    args = parse(Args, description=__doc__)
+    args = parse_arguments(Args, __doc__)
     if args.table:
         if not write_part(ROOT / "README.md", "speed", readme_table()):
             refuse("--table", "README.md has no <!-- speed --> … <!-- end speed -->, once, to write between")

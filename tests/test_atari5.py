@@ -287,6 +287,8 @@ def test_a_run_goes_on_with_the_arithmetic_that_it_began_with(tmp_path):
         ["--cpus-per-run", "10000"],
         ["--out", "/proc/nothing"],
         ["--out", "/dev/null"],
+        ["--out", "o\udcff"],  # a byte that is no UTF-8, as Python decodes it
+        ["--games", "o\udcff"],
         ["--games", "Q" * 300],
         ["--address", "127.0.0.1:1"],
         ["--address", "nonsense"],

@@ -631,6 +631,7 @@ def test_a_pair_that_cannot_be_compared_is_refused_in_one_line(flags, said, tmp_
         (["--out", "empty"], "no run there has an iteration"),
         (["--out", "foreign"], "has other columns"),
         (["--out", "damaged"], "cannot be read"),
+        (["--out", "o\udcff"], "--out {}/o?: give it in UTF-8"),  # a byte that is no UTF-8, as Python decodes it
     ],
 )
 def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, capfd):
@@ -644,7 +645,15 @@ def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, ca
         with pytest.raises(SystemExit) as exit_:
             call(monkeypatch, *flags, command=command)
         out, err = capfd.readouterr()
-        assert exit_.value.code == 2 and out == "" and err.count("\n") == 1 and said in err
+        assert exit_.value.code == 2 and out == "" and err.count("\n") == 1 and said.format(tmp_path) in err
+
+
+def test_a_directory_below_one_whose_name_is_no_utf_8_is_refused(tmp_path, monkeypatch, capfd):
+    (tmp_path / "o\udcff").mkdir()
+    monkeypatch.chdir(tmp_path / "o\udcff")
+    with pytest.raises(SystemExit) as exit_:
+        call(monkeypatch, "--out", "grid", command=collect)
+    assert (exit_.value.code, capfd.readouterr().err) == (2, f"--out {tmp_path}/o?/grid: give it in UTF-8\n")
 
 
 def test_a_readme_that_has_lost_its_marks_is_said_and_left(tmp_path, monkeypatch, capfd):

@@ -198,6 +198,8 @@ def test_the_readme_s_speeds_are_those_of_the_committed_csvs():
         (["script.py", "--cleanrl", "."], "the directory of a checkout"),
         (["script.py", "--csv", "script.py"], "it holds other columns"),
         (["script.py", "--csv", "script.py/throughput.csv"], "cannot be written"),
+        (["script.py", "--csv", "c\udcff"], "give it in UTF-8"),  # a byte that is no UTF-8, as Python decodes it
+        (["s\udcff.py"], "give it in UTF-8"),
     ],
 )
 def test_bad_input_is_refused_in_one_line_and_leaves_nothing(flags, said, tmp_path, monkeypatch, capfd):

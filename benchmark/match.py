@@ -126,12 +126,12 @@ def main() -> None:
         found[game] = interpolate(list(bounds), tried, wanted, search.rises)
         table.append([game, *(f"{mean:.3g}" for mean in (wanted, *tried)), f"{found[game]:.4f}"])
     names = [f"{search.symbol} = {bound:g}" for bound in bounds]
-    print(markdown(["game", " ".join(search.matched), *names, f"matching {search.symbol}"], table))
+    tell(markdown(["game", " ".join(search.matched), *names, f"matching {search.symbol}"], table))
     if without := [game for game, bound in found.items() if math.isnan(bound)]:
         advice = f"the {args.on} to match is not between those of the tried bounds; give other --bounds, or more "
         say(f"{', '.join(without)}: {advice}--iterations")
         sys.exit(1)
-    print(f"Geometric mean over the games: {search.symbol} = {np.exp(np.mean(np.log(list(found.values())))):.4f}")
+    tell(f"Geometric mean over the games: {search.symbol} = {np.exp(np.mean(np.log(list(found.values())))):.4f}")
 
 
 if __name__ == "__main__":

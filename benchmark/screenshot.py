@@ -18,7 +18,7 @@ from pathlib import Path
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import parse, refuse
+from bookkeeping import parse, refuse, tell
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 
@@ -69,7 +69,7 @@ def main(logdir: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path]
             subprocess.run([browser, *flags, url], stderr=subprocess.DEVNULL, check=True)
         finally:
             server.terminate()
-    print(picture)
+    tell(str(picture))
 
 
 if __name__ == "__main__":

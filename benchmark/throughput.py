@@ -417,14 +417,14 @@ def main() -> None:
     limits = measure_limits(atari[0], args.num_envs, args.threads) if atari else {}
     for (num_envs, threads), limit in limits.items():
         float32, bfloat16, emulator = (f"{value:,.0f}" for value in limit.values())
-        print(
+        tell(
             f"Limits with {threads} threads: convolutions {float32} GFLOP/s in float32 and {bfloat16} in bfloat16, "
             f"emulator {emulator} steps/s in {num_envs} environments."
         )
     for number in range(1, args.rounds + 1):
         for row in rows:
             row.rounds.append(run_jobs(row, args))
-            print(f"round {number}, {' / '.join(row.label)}: {row.speeds[-1]:,.0f} steps/s", file=sys.stderr)
+            say(f"round {number}, {' / '.join(row.label)}: {row.speeds[-1]:,.0f} steps/s")
             for job, run in enumerate(row.rounds[-1], start=1):
                 date = datetime.now(timezone.utc).isoformat(timespec="seconds")
                 numbers = {**run, **limits.get((row.num_envs, row.threads), {})}
@@ -437,11 +437,11 @@ def main() -> None:
 
     versions = f"torch {contenders[0].torch}, commit {contenders[0].commit}"
     protocol = f"{args.rounds} rounds of {args.window} iterations after {args.warmup}; median (minimum to maximum)"
-    print(f"\n{args.env_id} on {cpu}, {kind}, {available_cores()} cores, {versions}; {protocol}.\n")
-    print(speed_table(rows))
-    print(phase_table(rows))
+    tell(f"\n{args.env_id} on {cpu}, {kind}, {available_cores()} cores, {versions}; {protocol}.\n")
+    tell(speed_table(rows))
+    tell(phase_table(rows))
     if limits:
-        print(limits_table(rows, limits))
+        tell(limits_table(rows, limits))
 
 
 if __name__ == "__main__":

@@ -7,9 +7,11 @@ those of the thesis: minibatches of 256 screens for the update, 8 screens for a 
 """
 
 import os
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from statistics import median, quantiles
 
 if __name__ == "__main__":
@@ -17,10 +19,12 @@ if __name__ == "__main__":
 
 import numpy as np
 import torch
-import tyro
 from ale_py.vector_env import AtariVectorEnv
 from torch import nn
 from torch.distributions import Categorical
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
+from bookkeeping import parse, tell
 
 MINIBATCH, NUM_ENVS, NUM_ACTIONS = 256, 8, 6
 
@@ -114,8 +118,8 @@ def main(threads: int = 2, rounds: int = 15, seconds: float = 0.1) -> None:
         seconds: time that one measurement repeats its form for, at least once.
     """
     torch.set_num_threads(threads)
-    print(f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, {threads} threads, {rounds} rounds\n")
-    print("| trick | plain, ms | trick, ms | plain / trick (quartiles) |\n|-|-|-|-|")
+    tell(f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, {threads} threads, {rounds} rounds\n")
+    tell("| trick | plain, ms | trick, ms | plain / trick (quartiles) |\n|-|-|-|-|")
     for name, pair in tricks().items():
         measured = []
         for _ in range(rounds + 1):
@@ -124,7 +128,7 @@ def main(threads: int = 2, rounds: int = 15, seconds: float = 0.1) -> None:
         ratios = [a / b for a, b in zip(plain, trick)]
         low, _, high = quantiles(ratios, n=4)
         times = f"{1e3 * median(plain):.3g} | {1e3 * median(trick):.3g}"
-        print(f"| {name} | {times} | {median(ratios):.2f} ({low:.2f} to {high:.2f}) |", flush=True)
+        tell(f"| {name} | {times} | {median(ratios):.2f} ({low:.2f} to {high:.2f}) |")
 
 
 def time_of(form: Callable, seconds: float) -> float:
@@ -137,4 +141,4 @@ def time_of(form: Callable, seconds: float) -> float:
 
 
 if __name__ == "__main__":
-    tyro.cli(main)
+    parse(main)

@@ -1,11 +1,13 @@
 """A bound matches if the variant clips as many samples, or moves the policy as far, as the other one."""
 
 import math
+import subprocess
 import sys
 
 import pytest
 
 from benchmark import match
+from conftest import PATIENCE, environment
 
 
 @pytest.fixture
@@ -97,6 +99,19 @@ def test_a_script_that_fails_ends_the_search_with_its_last_line(call, monkeypatc
         (tmp_path / script).write_text("import sys; sys.exit('first\\nthe reason')")
     monkeypatch.setattr(match, "ROOT", tmp_path)
     assert call("--on", "kl") == (2, "", "the reason\n")
+
+
+def test_a_table_that_cannot_be_written_is_no_failure(tmp_path):
+    program = """
+from benchmark import match
+match.mean_over_training = lambda column, script, *flags, steps: float(flags[1]) if "--clip-coef" in flags else 0.2
+match.main()
+"""
+    command = [sys.executable, "-c", program, "--on", "kl", "--games", "Pong", "--bounds", "0.1", "0.3"]
+    with open("/dev/full", "wb") as full:
+        options = {"env": environment(), "stdout": full, "stderr": subprocess.PIPE, "timeout": PATIENCE}
+        ended = subprocess.run(command, cwd=tmp_path, **options)
+    assert (ended.returncode, ended.stderr) == (0, b"")
 
 
 @pytest.mark.slow

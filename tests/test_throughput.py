@@ -1,5 +1,6 @@
 """The speed measurements: how the numbers are read, their tables, and one call as a user makes it."""
 
+import ast
 import sys
 
 import pytest
@@ -138,6 +139,13 @@ def test_a_call_prints_a_row_for_each_contender_and_adds_one_for_each_process(tm
     assert all(float(line[f"time/{name}"]) > 0 for name in work)
     assert line["torch"].startswith("2.13.0") and line["cpu"] and line["commit"] and line["date"]
     assert line["kind"] == bookkeeping.kind_of_processor()
+
+
+@pytest.mark.parametrize("program", sorted((ROOT / "benchmark").glob("*.py")), ids=lambda path: path.stem)
+def test_no_program_prints_what_may_have_no_reader(program):
+    """`print` ends it in a traceback or status 120 after `| true`, or on a full disk; `tell` does not."""
+    nodes = ast.walk(ast.parse(program.read_bytes()))
+    assert [node.lineno for node in nodes if isinstance(node, ast.Name) and node.id == "print"] == []
 
 
 def test_rows_with_other_phases_are_added_and_those_that_are_there_stay(tmp_path):

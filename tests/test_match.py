@@ -55,7 +55,10 @@ def test_means_that_do_not_go_one_way_give_no_match():
         (["--on", "clipfrac", "--bounds", "0.1", "-0.1"], "--bounds"),
         (["--on", "kl", "--iterations", "0"], "--iterations"),
         (["--on", "kl", "--jobs", "0"], "--jobs"),
-        (["--on", "kl", "--games", "Pong", "P\udcff"], "--games P?: give it in UTF-8"),  # as Python decodes the byte
+        (
+            ["--on", "kl", "--games", "Pong", "P\udcff"],
+            "--games P\ufffd: give it in UTF-8",
+        ),  # as Python decodes the byte
     ],
 )
 def test_what_cannot_work_is_refused_in_one_line(flags, said, call):

@@ -49,7 +49,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they 
 from benchmark.arguments import parse_arguments
 from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, in_own_process, measure_limits
 from benchmark.readme import markdown, write_part
-from bookkeeping import available_cores, kind_of_processor, refuse, say, tell, write_text
+from bookkeeping import available_cores, commit_of, kind_of_processor, refuse, say, tell, write_text
 from wrappers import find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -160,7 +160,8 @@ def make_contenders(args: Args) -> list[Contender]:
             script, *flags = shlex.split(given) or [""]
         except ValueError as error:
             refuse(repr(given), f"{error}; a script and its flags are read as a shell reads them")
-        if not Path(script).is_file():
+        path = Path(script).absolute()
+        if not path.is_file():
             refuse(repr(given), "no such script; give a path, with the script's flags inside the same quotes")
         for flag in flags:
             if re.match(r"--(env.id|num.envs|num.steps|total.timesteps|threads|log.dir)\b", flag):
@@ -168,7 +169,7 @@ def make_contenders(args: Args) -> list[Contender]:
         repeat = args.contenders[:i].count(given)
         command = (sys.executable, script, *flags, "--env-id", args.env_id)
         name = f"{given} ({repeat + 1})" if repeat else given
-        contenders.append(Contender(name, command, commit_of(Path(script).parent), torch))
+        contenders.append(Contender(name, command, commit_of(str(path), str(path.parent)), torch))
     if args.peer:
         try:
             version = importlib.metadata.version("stable-baselines3")
@@ -176,7 +177,7 @@ def make_contenders(args: Args) -> list[Contender]:
             refuse("--peer", "Stable-Baselines3 is not installed; pip install -e '.[peer]'")
         script = Path(__file__).resolve().parent / "sb3_ppo.py"
         command = (sys.executable, str(script), "--env-id", peer_id(args.env_id))
-        contenders.append(Contender(f"Stable-Baselines3 {version}", command, commit_of(script.parent), torch, True))
+        contenders.append(Contender(f"Stable-Baselines3 {version}", command, commit_of(str(script)), torch, True))
     if args.cleanrl:
         script, python = args.cleanrl.resolve() / "cleanrl" / "ppo_atari.py", shutil.which(args.cleanrl_python)
         if not script.is_file():
@@ -187,16 +188,9 @@ def make_contenders(args: Args) -> list[Contender]:
         # The prefix has Gymnasium import ale-py: under 0.29 the versions that ship ROMs do not register by themselves
         command = (os.path.abspath(python), str(script), "--env-id", f"ale_py:{peer_id(args.env_id)}", "--no-cuda")
         environment = {"PYTHONPATH": str(args.cleanrl.resolve())}
-        contenders.append(Contender("CleanRL", command, commit_of(script.parent), torch, True, environment))
+        commit = commit_of(str(script), str(script.parent))
+        contenders.append(Contender("CleanRL", command, commit, torch, True, environment))
     return contenders
-
-
-def commit_of(directory: Path) -> str:
-    git = ["git", "-C", str(directory), "describe", "--always", "--dirty", "--abbrev=40"]
-    try:
-        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return "not a git checkout"
 
 
 # --------------------------------------------------------------------------------------------- runs and their logs

@@ -1,6 +1,7 @@
 """The speed measurements: how the numbers are read, their tables, and one call as a user makes it."""
 
 import ast
+import subprocess
 import sys
 
 import pytest
@@ -156,6 +157,24 @@ def test_rows_with_other_phases_are_added_and_those_that_are_there_stay(tmp_path
     assert header == [*throughput.CSV_FIELDS, "time/storage", "time/rest"]
     kept = [[line[name] for name in ("contender", "steps_per_second", "time/storage", "time/rest")] for line in rows]
     assert kept == [["a", "1", "0.5", ""], ["b, c", "2", "", "0.25"]]
+
+
+def test_a_contender_s_commit_is_that_of_its_own_checkout(tmp_path, monkeypatch):
+    monkeypatch.setenv("GIT_DIR", str(tmp_path / "of another repository"))  # as in a git hook
+
+    def git(*words: str) -> str:
+        settings = [f"--git-dir={tmp_path / '.git'}", *"-c user.name=a -c user.email=b -c commit.gpgsign=no".split()]
+        return subprocess.run(["git", *settings, *words], check=True, capture_output=True, text=True).stdout.strip()
+
+    for name in ("committed.py", "beside.py"):
+        (tmp_path / name).touch()
+    args = throughput.Args(contenders=("committed.py", "beside.py"))
+    monkeypatch.chdir(tmp_path)
+    git("init", "--quiet")
+    git("add", "committed.py")
+    git("commit", "--quiet", "--message=one")
+    committed, beside = throughput.make_contenders(args)
+    assert (committed.commit, beside.commit) == (git("rev-parse", "HEAD"), git("rev-parse", "HEAD") + "-dirty")
 
 
 def test_the_readme_s_table_compares_within_a_round_of_a_call_alone(tmp_path):

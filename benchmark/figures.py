@@ -12,6 +12,7 @@ A stage is `finished` or `beginnings`. Each game of `finished` shows its finishe
 `beginnings` all its runs, as far as the longest unfinished one.
 """
 
+import io
 import itertools
 import json
 import math
@@ -58,7 +59,7 @@ from benchmark.claims import (
 )
 from benchmark.collect import DEFAULT_OUT, KEY, ROOT, read_grid
 from benchmark.readme import split_readme, write_part
-from bookkeeping import refuse, tell, write_text
+from bookkeeping import refuse, tell, write_bytes, write_text
 from wrappers import FRAME_SKIP, find_atari_game
 
 # Figure → its title and the columns it shows, each with its y axis
@@ -212,8 +213,8 @@ def draw(out: Path, stages: list[Stage]) -> None:
         with matplotlib.rc_context({**matplotlib.rcParamsDefault, **settings}):  # not the user's matplotlibrc
             figure = draw_figure(name, stage)
             for suffix, metadata in (("png", {}), ("svg", {"Date": None})):  # equal CSVs give equal files
-                figure.savefig(directory / f"new.{suffix}", metadata=metadata)
-                os.replace(directory / f"new.{suffix}", directory / f"{name}.{suffix}")
+                figure.savefig(file := io.BytesIO(), format=suffix, metadata=metadata)
+                write_bytes(directory / f"{name}.{suffix}", file.getvalue())
 
 
 # ------------------------------------------------------------------------------------------------- OUT/README.md

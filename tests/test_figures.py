@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import resource
 import shutil
 import subprocess
 import sys
@@ -598,6 +599,35 @@ def test_a_call_makes_everything_the_same_again_and_touches_no_other_grid(tmp_pa
     assert after == {name: data for name, data in before.items() if not name.startswith("runs/")}
 
 
+@pytest.mark.parametrize(
+    ("command", "largest", "file"),
+    [(collect, 4000, "curves.csv"), (figures, 9000, "figures/finished/score.png")],
+    ids=["collect", "figures"],
+)
+def test_on_a_full_disk_the_file_is_named_and_all_are_as_before(
+    command, largest, file, tmp_path, monkeypatch, capfd, two_figures
+):
+    """No file can grow beyond `largest` bytes, as if the disk were full."""
+    make_run(tmp_path, kl=range(1, 501), mean_return_100=range(500))
+    (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+    if command is figures:
+        (tmp_path / file).write_bytes(b"as it was")
+        collect.collect(tmp_path)
+        monkeypatch.setattr(figures, "read_grid", collect.read_csvs)
+    before, limits = contents(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (largest, limits[1]))
+    try:
+        with pytest.raises(SystemExit) as ended:
+            call(monkeypatch, "--out", tmp_path, command=command)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    said = f"--out {tmp_path}: cannot use {tmp_path / file} (File too large)\n"
+    assert (ended.value.code, capfd.readouterr().err) == (2, said)
+    after = contents(tmp_path)
+    assert {name: data for name, data in after.items() if name in before} == before
+    assert set(after) - set(before) <= {"runs.csv", "README.md"}  # each of which is whole
+
+
 def test_another_pair_s_verdicts_go_into_the_grid_s_readme_alone(tmp_path, monkeypatch):
     monkeypatch.setattr(figures, "DEFAULT_OUT", tmp_path)  # beside a project whose README has no place for a table
     monkeypatch.setattr(figures, "ROOT", tmp_path / "nowhere")
@@ -631,7 +661,7 @@ def test_a_pair_that_cannot_be_compared_is_refused_in_one_line(flags, said, tmp_
         (["--out", "empty"], "no run there has an iteration"),
         (["--out", "foreign"], "has other columns"),
         (["--out", "damaged"], "cannot be read"),
-        (["--out", "o\udcff"], "--out {}/o?: give it in UTF-8"),  # a byte that is no UTF-8, as Python decodes it
+        (["--out", "o\udcff"], "--out {}/o\ufffd: give it in UTF-8"),  # a byte that is no UTF-8, as Python decodes it
     ],
 )
 def test_bad_input_is_refused_in_one_line(flags, said, tmp_path, monkeypatch, capfd):
@@ -653,7 +683,7 @@ def test_a_directory_below_one_whose_name_is_no_utf_8_is_refused(tmp_path, monke
     monkeypatch.chdir(tmp_path / "o\udcff")
     with pytest.raises(SystemExit) as exit_:
         call(monkeypatch, "--out", "grid", command=collect)
-    assert (exit_.value.code, capfd.readouterr().err) == (2, f"--out {tmp_path}/o?/grid: give it in UTF-8\n")
+    assert (exit_.value.code, capfd.readouterr().err) == (2, f"--out {tmp_path}/o\ufffd/grid: give it in UTF-8\n")
 
 
 def test_a_readme_that_has_lost_its_marks_is_said_and_left(tmp_path, monkeypatch, capfd):

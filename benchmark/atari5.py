@@ -353,7 +353,7 @@ def run_grid(runs: list[Run], args: Args) -> None:
     # "local" even if RAY_ADDRESS is set. Nothing is stored in the object store: near the least that Ray takes.
     cores = {"num_cpus": args.cores or available_cores(), "object_store_memory": 100_000_000}
     cores["include_dashboard"] = False
-    pending = {}
+    pending, interrupt = {}, Interrupt()
     try:
         try:
             ray.init(args.address or "local", **quiet, **({} if args.address else cores))
@@ -361,7 +361,7 @@ def run_grid(runs: list[Run], args: Args) -> None:
             reason = (str(error) or repr(error)).splitlines()[0]
             advice = "" if args.address else "; set RAY_TMPDIR or TMPDIR to a short path that can be written"
             refuse(f"--address {args.address or 'local'}", f"Ray does not start ({reason}){advice}")
-        Interrupt().listen()  # after init, which has a handler for SIGTERM
+        interrupt.listen()  # after init, which has a handler for SIGTERM
         most = max(node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"])
         if args.cpus_per_run > most:
             refuse(f"--cpus-per-run {args.cpus_per_run}", f"no node has more than {most:.0f}")
@@ -385,9 +385,11 @@ def run_grid(runs: list[Run], args: Args) -> None:
         # Each task is told and awaited, because Ray kills the children of a worker that it shuts down with SIGKILL
         if pending:
             say("\nStopping: each run writes a checkpoint; another signal, at least a second from now, ends at once")
+            interrupt.listen()  # serves the second of two signals now; Ray looks for it once a second
             for ref in pending:
                 ray.cancel(ref)
-            ray.wait(list(pending), num_returns=len(pending))
+            while ray.wait(list(pending), num_returns=len(pending), timeout=0.1)[1]:
+                pass
         raise
     finally:
         ray.shutdown()

@@ -253,6 +253,20 @@ def test_a_grid_in_the_background_of_a_script_ends_on_sigterm(tmp_path):
     assert all(is_one_curve(path) for path in run_dirs(tmp_path).values())
 
 
+@pytest.mark.slow
+def test_runs_are_waited_for_if_a_signal_comes_twice(tmp_path):
+    """As launchers send it. An iteration takes long enough for a run that is not waited for to be killed in it."""
+    variant = f"slow={ROOT / 'ppo_atari.py'} --update-epochs 1000"
+    driver = start(tmp_path, "--games", "CartPole-v1", "--variants", variant)
+    wait_for(lambda: any(map(has_logged, (tmp_path / "runs").glob("*/events.*"))))
+    driver.terminate()
+    time.sleep(0.005)
+    driver.send_signal(signal.SIGINT)
+    assert driver.wait(timeout=GUARD) == 130
+    (log,) = (tmp_path / "logs").iterdir()
+    assert "Stopped; go on with" in log.read_text()
+
+
 # ------------------------------------------------------------------------------------------------------- without Ray
 def test_dry_run_prints_the_commands_seed_by_seed_and_starts_nothing(tmp_path, call):
     flags = ["--games", "Phoenix", "Qbert", "--seeds", "1", "2", "2", "--stop-at", "5000", "--bf16", "--dry-run"]

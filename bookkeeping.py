@@ -169,11 +169,9 @@ def warn_of_emulation(args) -> None:
 
 def tune_process() -> None:
     """Sets up a process that trains, before it imports torch: how threads wait, and how memory is kept."""
-    # Idle OpenMP threads would spin on the cores that the games' threads need. For a moment they may: on processors
-    # with AMX, waking one takes longer than the network on 8 screens does.
-    if "OMP_WAIT_POLICY" not in os.environ:
-        os.environ["OMP_WAIT_POLICY"] = "PASSIVE"
-        os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+    # Idle OpenMP threads would spin on the cores that the games' threads need. GOMP_SPINCOUNT=10000 has them spin for a
+    # moment: a tenth faster if nothing else runs, a fifth slower beside one other process (benchmark/README.md)
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping
     # them cuts these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):

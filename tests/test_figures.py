@@ -7,6 +7,7 @@ import resource
 import shutil
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pandas as pd
@@ -15,6 +16,7 @@ from matplotlib.figure import Figure
 from torch.utils.tensorboard import SummaryWriter
 
 from benchmark import claims, collect, figures, readme
+from bookkeeping import EventFile
 from conftest import ROOT
 
 BATCH = 1024  # agent steps of an iteration
@@ -42,13 +44,10 @@ def make_run(out, variant="ppo", game="CartPole-v1", seed=1, started=1, **column
     return directory
 
 
-def log(directory, points: dict[str, dict[int, float]], suffix: str = "", time: float | None = None) -> None:
-    """Writes an event file: tag → iteration → value, written at `time` (seconds since the epoch, or now)."""
-    writer = SummaryWriter(str(directory), filename_suffix=suffix)
-    for tag, values in points.items():
-        for iteration, value in values.items():
-            writer.add_scalar(tag, value, iteration * BATCH, walltime=time)
-    writer.close()
+def log(directory, points: dict[str, dict[int, float]]) -> None:
+    """Writes an event file as a start of a run does: tag → iteration → value."""
+    of_tags = ((tag, iteration, value) for tag, values in points.items() for iteration, value in values.items())
+    EventFile(str(directory)).append([(iteration * BATCH, tag, value) for tag, iteration, value in of_tags])
 
 
 def make_csvs(out, runs: dict[tuple, dict], iterations: int | None = None, bf16=()) -> None:
@@ -112,11 +111,11 @@ def test_all_points_are_read(tmp_path):
     assert list(curve.kl) == list(range(10_001))
 
 
-def test_a_step_that_was_logged_twice_keeps_what_was_written_last(tmp_path):
+def test_a_step_that_was_logged_twice_keeps_what_was_written_last_by_whatever_clock(tmp_path, monkeypatch):
     directory = make_run(tmp_path, kl=[1, 2, 3, 4])
-    log(directory, {"losses/kl": {3: 30, 4: 40, 5: 50}, "losses/clipfrac": {5: 0.5}}, suffix=".resumed")
-    log(directory, {"losses/kl": {1: -1}}, suffix=".the-last-name-but-the-first-to-be-written", time=1.0)
-    log(directory, {"losses/kl": {5: 55}}, suffix=".again")
+    log(directory, {"losses/kl": {3: 30, 4: 40, 5: 50}, "losses/clipfrac": {5: 0.5}})
+    monkeypatch.setattr(time, "time", lambda: 1.0)
+    log(directory, {"losses/kl": {5: 55}})
     curve = collect.read_curve(collect.read_events(directory))
     assert list(curve.kl) == [1, 2, 30, 40, 55]
     assert curve.clipfrac.iloc[-1] == 0.5 and curve.clipfrac[:-1].isna().all()
@@ -169,7 +168,7 @@ def test_runs_without_a_directory_keep_their_rows_and_found_ones_replace_theirs(
     make_run(tmp_path, seed=2, kl=[3])
     collect.collect(tmp_path)
     shutil.rmtree(first)
-    log(tmp_path / "runs" / "CartPole-v1__ppo__2__1", {"losses/kl": {2: 4}}, suffix=".more")
+    log(tmp_path / "runs" / "CartPole-v1__ppo__2__1", {"losses/kl": {2: 4}})
     make_run(tmp_path, "acppo", kl=[5])
     collect.collect(tmp_path)
     assert capfd.readouterr().err == ""

@@ -46,6 +46,18 @@ def update(network: nn.Module, screens: torch.Tensor) -> Callable:
     return run
 
 
+def update_bf16(network: nn.Module, screens: torch.Tensor, dtype: torch.dtype) -> Callable:
+    """Returns an update under `--bf16`, with screens that are divided in `dtype`."""
+
+    def run():
+        network.zero_grad()
+        with torch.autocast("cpu", torch.bfloat16):
+            output = network(screens.to(dtype).div_(255.0)).float()
+        output.square().mean().backward()
+
+    return run
+
+
 def optimizer_step(fused: bool) -> Callable:
     network = nature_cnn()
     network(torch.rand(2, 4, 84, 84)).sum().backward()
@@ -97,6 +109,10 @@ def tricks() -> dict[str, tuple[Callable, Callable]]:
         "update: fused Adam": (optimizer_step(fused=False), optimizer_step(fused=True)),
         "minibatch: index_select for obs[indices]": (lambda: nhwc[chosen], lambda: nhwc.index_select(0, chosen)),
         "minibatch: .float().div_(255) for / 255": (lambda: last / 255.0, lambda: last.float().div_(255.0)),
+        "update, bfloat16: screens cast to it at once, not by way of float32": (
+            update_bf16(channels_last, last, torch.float32),
+            update_bf16(channels_last, last, torch.bfloat16),
+        ),
         "rollout: inference_mode for no_grad": (
             forward(channels_last, last[:NUM_ENVS], torch.no_grad),
             forward(channels_last, last[:NUM_ENVS], torch.inference_mode),

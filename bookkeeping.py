@@ -34,6 +34,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import timedelta
+from pathlib import Path
 from typing import Annotated, Any
 
 import filelock
@@ -92,7 +93,10 @@ def flag(name: str, value: object) -> str:
 
 
 def parse(args_class: Callable, **given):
-    """Parses the command line with tyro. `--help` that has no reader, or no letter for ε, is no failure."""
+    """Parses the command line with tyro. `--help` that has no reader, or no letter for ε, is no failure.
+
+    Refuses what is not UTF-8, and a path below a directory whose name is not: no record could hold it.
+    """
     for descriptor in range(3):  # of those that were closed before Python started, a file of ours would get the number
         try:
             os.fstat(descriptor)
@@ -103,12 +107,20 @@ def parse(args_class: Callable, **given):
     sys.stdout.reconfigure(errors="replace")
     try:
         try:
-            return tyro.cli(args_class, **given)
+            args = tyro.cli(args_class, **given)
         finally:
             sys.stdout.flush()
     except OSError:  # Python would flush again at its end, and fail
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
         sys.exit(0 if {"-h", "--help"} & set(sys.argv) else 2)
+    for name, value in getattr(args, "__dict__", {}).items():
+        for one in value if isinstance(value, tuple) else [value]:
+            text = str(one.absolute() if isinstance(one, Path) else one)
+            try:
+                in_utf8(text, errors="strict")
+            except UnicodeDecodeError:
+                refuse(flag(name, text), "give it in UTF-8")
+    return args
 
 
 def file_name(script: str) -> str:
@@ -214,10 +226,6 @@ def check(args) -> None:
     """Refuses the first argument that is out of its bounds or breaks one of `args.rules()`."""
     for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
-        try:
-            in_utf8(str(value), errors="strict")
-        except UnicodeDecodeError:  # it could not be written into the run's record
-            refuse(flag(name, value), "give it in UTF-8")
         for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # `X | None` has X among its args
             for bounds in getattr(kind, "__metadata__", ()):
                 if isinstance(bounds, Bounds) and not bounds.allow(value):

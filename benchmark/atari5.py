@@ -38,7 +38,6 @@ from pathlib import Path
 from types import ModuleType
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.arguments import parse_arguments
 from bookkeeping import RETIRED, StopSignal, available_cores, parse, refuse, say, tell
 from bookkeeping import check as check_bounds
 
@@ -444,7 +443,7 @@ class Progress:
 
 
 def main() -> None:
-    args = parse_arguments(Args, __doc__)
+    args = parse(Args, description=__doc__)
     check(args)
     args.out = args.out.resolve()  # the tasks stand elsewhere
     try:

@@ -20,8 +20,7 @@ import pandas as pd
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.arguments import parse_arguments
-from bookkeeping import refuse, say, tell, write_text
+from bookkeeping import parse, refuse, say, tell, write_text
 
 ROOT = Path(__file__).resolve().parent.parent
 DEFAULT_OUT = ROOT / "benchmark" / "results"
@@ -178,7 +177,7 @@ def read_grid(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
 
 
 def main() -> None:
-    args = parse_arguments(Args, __doc__)
+    args = parse(Args, description=__doc__)
     try:
         runs, curves = read_grid(args.out)
     except OSError as error:

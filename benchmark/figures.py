@@ -36,7 +36,6 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter, NullFormatter
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.arguments import parse_arguments
 from benchmark.claims import (
     FEWEST_PAIRS,
     FINISHED,
@@ -59,7 +58,7 @@ from benchmark.claims import (
 )
 from benchmark.collect import DEFAULT_OUT, KEY, ROOT, read_grid
 from benchmark.readme import split_readme, write_part
-from bookkeeping import refuse, tell, write_bytes, write_text
+from bookkeeping import parse, refuse, tell, write_bytes, write_text
 from wrappers import FRAME_SKIP, find_atari_game
 
 # Figure → its title and the columns it shows, each with its y axis
@@ -292,7 +291,7 @@ def results_part(stages: list[Stage]) -> str:
 
 
 def main() -> None:
-    args = parse_arguments(Args, __doc__)
+    args = parse(Args, description=__doc__)
     try:
         runs, curves = read_grid(args.out)
         known = sorted(runs.variant.unique())

@@ -26,10 +26,9 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.arguments import parse_arguments
 from benchmark.collect import ROOT, read_curve, read_events
 from benchmark.readme import markdown
-from bookkeeping import available_cores, refuse, say, tell
+from bookkeeping import available_cores, parse, refuse, say, tell
 
 
 @dataclass
@@ -92,7 +91,7 @@ def interpolate(bounds: list[float], means: list[float], wanted: float, rises: b
 
 
 def main() -> None:
-    args = parse_arguments(Args, __doc__)
+    args = parse(Args, description=__doc__)
     if args.on not in SEARCHES:
         refuse(f"--on {args.on}", f"give {' or '.join(SEARCHES)}")
     search = SEARCHES[args.on]

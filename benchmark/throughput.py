@@ -46,10 +46,9 @@ import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.arguments import parse_arguments
 from benchmark.limits import AGENT_STEP, KL_PASS, LIMITS, in_own_process, measure_limits
 from benchmark.readme import markdown, write_part
-from bookkeeping import available_cores, commit_of, kind_of_processor, refuse, say, tell, write_text
+from bookkeeping import available_cores, commit_of, kind_of_processor, parse, refuse, say, tell, write_text
 from wrappers import find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -57,7 +56,7 @@ RESULTS = ROOT / "benchmark" / "results"
 NUM_STEPS = 128  # agent steps of each environment in one iteration (appendix A): the default of every contender
 OF_PROCESS = ("time/first_iteration", "time/iteration", "time/unaccounted")  # every other `time/…` is a phase
 # A script's phases follow, by the names that it logs them under
-CSV_FIELDS = "date env_id contender commit torch cpu kind round job num_envs threads jobs warmup window".split()
+CSV_FIELDS = "call date env_id contender commit torch cpu kind round job num_envs threads jobs warmup window".split()
 CSV_FIELDS += ["steps_per_second", "peak_mb", *LIMITS, *OF_PROCESS]
 IN_README = ("ppo_atari.py", "ppo_atari.py --bf16")  # contenders of the README's table
 
@@ -385,14 +384,14 @@ def readme_table(directory: Path = RESULTS) -> str:
             setting = "{env_id}, {num_envs} environments, {threads} threads, torch {torch}"
             settings[setting.format(**runs[0])] = None
     columns = ["processor", "script", "steps/s", "× CleanRL", "× Stable-Baselines3", "peak MB"]
-    said = f"{'; '.join(settings)}: median (minimum to maximum) over rounds. "
+    said = f"{'; '.join(settings)}: median (minimum to maximum) over the rounds of all calls. "
     said += "A round runs each script once; a ratio is taken within one."
     return markdown(columns, table) + f"\n{said}\n"
 
 
 # ------------------------------------------------------------------------------------------------- command line
 def main() -> None:
-    args = parse_arguments(Args, __doc__)
+    args = parse(Args, description=__doc__)
     if args.table:
         if not write_part(ROOT / "README.md", "speed", readme_table()):
             refuse("--table", "README.md has no <!-- speed --> … <!-- end speed -->, once, to write between")
@@ -406,6 +405,7 @@ def main() -> None:
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
     cpu = (re.findall(r"model name\s*: (.*)", cpuinfo) or ["unknown processor"])[0]
     kind = in_own_process(kind_of_processor)
+    call = datetime.now(timezone.utc).isoformat(timespec="milliseconds")  # its rows are compared with each other alone
 
     atari = find_atari_game(args.env_id)
     limits = measure_limits(atari[0], args.num_envs, args.threads) if atari else {}
@@ -424,7 +424,7 @@ def main() -> None:
                 numbers = {**run, **limits.get((row.num_envs, row.threads), {})}
                 numbers = {column: f"{value:.6g}" for column, value in numbers.items()}
                 identity = {"contender": row.contender.name, "date": date, "cpu": cpu, "kind": kind}
-                identity |= {"round": number, "job": job}
+                identity |= {"call": call, "round": number, "job": job}
                 # The row after the arguments: it has one value for those that have several
                 record = {**vars(args), **vars(row.contender), **vars(row), **identity}
                 add_rows(args.csv, [{**{name: record.get(name, "") for name in CSV_FIELDS}, **numbers}])

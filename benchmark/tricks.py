@@ -72,11 +72,15 @@ def forward(network: nn.Module, screens: torch.Tensor, mode: Callable) -> Callab
     return run
 
 
-def rollout_step(groups: int) -> Callable:
-    """Returns one agent step in 8 games. With two groups, the games of one run while the network serves the other."""
+def rollout_step(groups: int = 1, num_threads: int = 2, **options) -> Callable:
+    """Returns one agent step in 8 games. With two groups, the games of one run while the network serves the other.
+
+    `num_threads` and `options` are ale-py's.
+    """
     network = nature_cnn().to(memory_format=torch.channels_last)
     size = NUM_ENVS // groups
-    games = [AtariVectorEnv("breakout", size, num_threads=2 // groups, use_fire_reset=False) for _ in range(groups)]
+    options = {"num_threads": num_threads // groups, "use_fire_reset": False, **options}
+    games = [AtariVectorEnv("breakout", size, **options) for _ in range(groups)]
     for envs in games:
         envs.reset(seed=1)
     actions, pool = np.ones(size, dtype=np.int64), ThreadPoolExecutor(1)
@@ -121,7 +125,12 @@ def tricks() -> dict[str, tuple[Callable, Callable]]:
             lambda: Categorical(logits=logits).sample(),
             lambda: torch.multinomial(logits.log_softmax(-1).exp(), 1).squeeze(-1),
         ),
-        "rollout: half the games run while the network serves the others (refused)": (rollout_step(1), rollout_step(2)),
+        "rollout: half the games run while the network serves the others (refused)": (rollout_step(), rollout_step(2)),
+        "rollout: four threads for the games, not two (refused)": (rollout_step(), rollout_step(num_threads=4)),
+        "rollout: the games' threads bound to a core each (refused)": (
+            rollout_step(),
+            rollout_step(thread_affinity_offset=0),
+        ),
     }
 
 

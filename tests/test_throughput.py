@@ -159,6 +159,19 @@ def test_rows_with_other_phases_are_added_and_those_that_are_there_stay(tmp_path
     assert kept == [["a", "1", "0.5", ""], ["b, c", "2", "", "0.25"]]
 
 
+def test_the_rows_of_a_call_are_marked_as_such(tmp_path, monkeypatch):
+    """So that a second call into the same file is no further round of the first one."""
+    measured = {"steps_per_second": 1.0, "peak_mb": 1.0, "time/first_iteration": 1.0, "time/iteration": 1.0}
+    monkeypatch.setattr(throughput, "run_jobs", lambda row, args: [{**measured, "time/unaccounted": 0.0}])
+    flags = ["ppo_atari.py", "--env-id", "CartPole-v1", "--rounds", "2", "--csv", str(tmp_path / "calls.csv")]
+    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags])
+    monkeypatch.chdir(ROOT)
+    throughput.main()
+    throughput.main()
+    calls = [line["call"] for line in throughput.read_csv(tmp_path / "calls.csv")[1]]
+    assert calls[0] == calls[1] != calls[2] == calls[3]
+
+
 def test_a_contender_s_commit_is_that_of_its_own_checkout(tmp_path, monkeypatch):
     monkeypatch.setenv("GIT_DIR", str(tmp_path / "of another repository"))  # as in a git hook
 

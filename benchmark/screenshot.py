@@ -13,6 +13,7 @@ import subprocess
 import sys
 import time
 import urllib.request
+from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
@@ -21,6 +22,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they 
 from bookkeeping import parse, refuse, tell
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+
+
+@dataclass
+class Args:
+    logdir: tyro.conf.Positional[Path]
+    """directory with run directories"""
+    picture: tyro.conf.Positional[Path]
+    """PNG file to write"""
+    width: int = 1500
+    """of the browser's window, pixels"""
+    height: int = 760
+    """of the browser's window, pixels"""
 
 
 def free_port() -> int:
@@ -39,22 +52,15 @@ def wait_for(url: str, server: subprocess.Popen, seconds: float = 60) -> bool:
     return False
 
 
-def main(logdir: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path], width: int = 1500, height: int = 760):
-    """Takes the picture.
-
-    Args:
-        logdir: directory with run directories.
-        picture: PNG file to write.
-        width: of the browser's window, pixels.
-        height: of the browser's window, pixels.
-    """
+def main() -> None:
+    args = parse(Args, description=__doc__)
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         refuse(" or ".join(BROWSERS), "none is installed")
-    if not any(logdir.rglob("events.out.tfevents*")):
-        refuse(str(logdir), "no event files in it")
+    if not any(args.logdir.rglob("events.out.tfevents*")):
+        refuse(str(args.logdir), "no event files in it")
     port = free_port()
-    module = [sys.executable, "-m", "tensorboard.main", "--logdir", str(logdir), "--port", str(port)]
+    module = [sys.executable, "-m", "tensorboard.main", "--logdir", str(args.logdir), "--port", str(port)]
     # --load_fast=false: the other reader shows a part of the points at first, and the picture would come too early
     with subprocess.Popen([*module, "--load_fast=false"], stderr=subprocess.DEVNULL) as server:
         try:
@@ -65,12 +71,13 @@ def main(logdir: tyro.conf.Positional[Path], picture: tyro.conf.Positional[Path]
             url = f"http://localhost:{port}/#custom_scalars"
             flags = ["--headless=new", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
             # The page draws itself after it has loaded: the browser's clock runs half a minute ahead, at once
-            flags += ["--virtual-time-budget=30000", f"--window-size={width},{height}", f"--screenshot={picture}"]
+            flags += ["--virtual-time-budget=30000", f"--window-size={args.width},{args.height}"]
+            flags += [f"--screenshot={args.picture}"]
             subprocess.run([browser, *flags, url], stderr=subprocess.DEVNULL, check=True)
         finally:
             server.terminate()
-    tell(str(picture))
+    tell(str(args.picture))
 
 
 if __name__ == "__main__":
-    parse(main, description=__doc__)
+    main()

@@ -311,6 +311,11 @@ def spread(values: list[float], digits: int = 0) -> str:
     return f"{middle} ({low} to {high})"
 
 
+def call_by_call(values: list[list[float]], digits: int = 0) -> str:
+    """The spread of each call that has values: machines of one kind may differ by half, so calls have no median."""
+    return "; ".join(spread(of_call, digits) for of_call in values if of_call) or "–"
+
+
 def ratios(row: Row, baseline: Row) -> list[float]:
     """How many times as fast as the baseline, round by round."""
     return [speed / baseline_speed for speed, baseline_speed in zip(row.speeds, baseline.speeds)]
@@ -358,35 +363,42 @@ def limits_table(rows: list[Row], limits: dict[tuple[int, int], dict[str, float]
     return markdown([*LABEL, *columns, *(f"{column} and emulator in turn" for column in columns[:2])], table)
 
 
+def columns_of(name: str, rounds: list[dict[str, dict]]) -> dict[str, list[float]]:
+    """Returns the README's columns for a script: its values in the rounds (contender → row) of one call that have it."""
+    columns = {"steps/s": [], "× CleanRL": [], "× Stable-Baselines3": [], "peak MB": []}
+    for rows in (rows for rows in rounds if name in rows):
+        speed = float(rows[name]["steps_per_second"])
+        columns["steps/s"].append(speed)
+        columns["peak MB"].append(float(rows[name]["peak_mb"]))
+        for contender, row in rows.items():
+            if (peer := f"× {contender.split(' ')[0]}") in columns:
+                columns[peer].append(speed / float(row["steps_per_second"]))
+    return columns
+
+
 def readme_table(directory: Path = RESULTS) -> str:
-    """Returns the README's table of speed: a line for each kind of processor and way to call the script."""
+    """Returns the README's table of speed: a line for each kind of processor and way to call the script.
+
+    Calls stand side by side, without a median of all: two machines of one kind may differ by half.
+    """
     table, settings = [], {}
     for path in sorted(directory.glob("throughput_*.csv")):
-        # What ran in one round of one call is compared: there, contender → its row
-        rounds: dict[tuple, dict[str, dict]] = {}
+        calls: dict[str, dict[str, dict[str, dict]]] = {}  # call → round → contender → its row
         for row in read_csv(path)[1]:
-            rounds.setdefault((row.get("call"), row["round"]), {})[row["contender"]] = row
+            calls.setdefault(row.get("call"), {}).setdefault(row["round"], {})[row["contender"]] = row
+        kind = row.get("kind") or path.stem.removeprefix("throughput_").upper()  # older rows have none
         for name in IN_README:
-            if not (shared := [of_round for of_round in rounds.values() if name in of_round]):
-                continue
-            times = {peer: [] for peer in ("CleanRL", "Stable-Baselines3")}
-            for of_round, peer in itertools.product(shared, times):
-                for contender, row in of_round.items():
-                    if contender.startswith(peer):
-                        speeds = (float(run["steps_per_second"]) for run in (of_round[name], row))
-                        times[peer].append(next(speeds) / next(speeds))
-            runs = [of_round[name] for of_round in shared]
-            kind = runs[0].get("kind") or path.stem.removeprefix("throughput_").upper()  # older rows have none
-            cells = [f"{runs[0]['cpu']}, {kind}", f"`{name}`"]
-            cells.append(spread([float(run["steps_per_second"]) for run in runs]))
-            cells += [spread(ratios, 2) if ratios else "–" for ratios in times.values()]
-            table.append([*cells, spread([float(run["peak_mb"]) for run in runs])])
-            setting = "{env_id}, {num_envs} environments, {threads} threads, torch {torch}"
-            settings[setting.format(**runs[0])] = None
-    columns = ["processor", "script", "steps/s", "× CleanRL", "× Stable-Baselines3", "peak MB"]
-    said = f"{'; '.join(settings)}: median (minimum to maximum) over the rounds of all calls. "
+            line = {"processor": f"{row['cpu']}, {kind}", "script": f"`{name}`"}
+            of_calls = [columns_of(name, list(call.values())) for call in calls.values()]
+            for column in of_calls[0]:
+                digits = 2 if column.startswith("×") else 0
+                line[column] = "; ".join(spread(call[column], digits) for call in of_calls if call[column]) or "–"
+            if line["steps/s"] != "–":
+                table.append(line)
+                settings["{env_id}, {num_envs} environments, {threads} threads, torch {torch}".format(**row)] = None
+    said = f"{'; '.join(settings)}: median (minimum to maximum) over the rounds of a call; calls side by side. "
     said += "A round runs each script once; a ratio is taken within one."
-    return markdown(columns, table) + f"\n{said}\n"
+    return markdown(list(table[0]), [list(line.values()) for line in table]) + f"\n{said}\n"
 
 
 # ------------------------------------------------------------------------------------------------- command line

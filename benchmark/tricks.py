@@ -6,16 +6,19 @@ Prints a table: milliseconds of each form (median) and the median of the pairwis
 those of the thesis: minibatches of 256 screens for the update, 8 screens for a step of the rollout. Takes two minutes.
 """
 
-import os
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median, quantiles
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
+from bookkeeping import kind_of_processor, parse, tell, tune_process
+
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # as the scripts do, before torch is imported
+    tune_process()  # as the scripts do, before torch is imported
 
 import numpy as np
 import torch
@@ -23,10 +26,17 @@ from ale_py.vector_env import AtariVectorEnv
 from torch import nn
 from torch.distributions import Categorical
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import parse, tell
-
 MINIBATCH, NUM_ENVS, NUM_ACTIONS = 256, 8, 6
+
+
+@dataclass
+class Args:
+    threads: int = 2
+    """torch's threads, and as many for the games"""
+    rounds: int = 15
+    """pairs of measurements"""
+    seconds: float = 0.1
+    """time that one measurement repeats its form for, at least once"""
 
 
 def nature_cnn(convolve_last: bool = False, inplace: bool = True) -> nn.Sequential:
@@ -72,14 +82,14 @@ def forward(network: nn.Module, screens: torch.Tensor, mode: Callable) -> Callab
     return run
 
 
-def rollout_step(groups: int = 1, num_threads: int = 2, **options) -> Callable:
+def rollout_step(num_threads: int, groups: int = 1, **options) -> Callable:
     """Returns one agent step in 8 games. With two groups, the games of one run while the network serves the other.
 
     `num_threads` and `options` are ale-py's.
     """
     network = nature_cnn().to(memory_format=torch.channels_last)
     size = NUM_ENVS // groups
-    options = {"num_threads": num_threads // groups, "use_fire_reset": False, **options}
+    options = {"num_threads": max(1, num_threads // groups), "use_fire_reset": False, **options}
     games = [AtariVectorEnv("breakout", size, **options) for _ in range(groups)]
     for envs in games:
         envs.reset(seed=1)
@@ -96,7 +106,7 @@ def rollout_step(groups: int = 1, num_threads: int = 2, **options) -> Callable:
     return run
 
 
-def tricks() -> dict[str, tuple[Callable, Callable]]:
+def tricks(threads: int) -> dict[str, tuple[Callable, Callable]]:
     """Returns the pairs to compare: name, plain form, trick."""
     nhwc = torch.randint(0, 256, (4 * MINIBATCH, 84, 84, 4), dtype=torch.uint8)
     chosen = torch.randperm(4 * MINIBATCH)[:MINIBATCH]
@@ -125,30 +135,28 @@ def tricks() -> dict[str, tuple[Callable, Callable]]:
             lambda: Categorical(logits=logits).sample(),
             lambda: torch.multinomial(logits.log_softmax(-1).exp(), 1).squeeze(-1),
         ),
-        "rollout: half the games run while the network serves the others (refused)": (rollout_step(), rollout_step(2)),
-        "rollout: four threads for the games, not two (refused)": (rollout_step(), rollout_step(num_threads=4)),
+        "rollout: half the games run while the network serves the others (refused)": (
+            rollout_step(threads),
+            rollout_step(threads, groups=2),
+        ),
+        "rollout: twice as many threads for the games (refused)": (rollout_step(threads), rollout_step(2 * threads)),
         "rollout: the games' threads bound to a core each (refused)": (
-            rollout_step(),
-            rollout_step(thread_affinity_offset=0),
+            rollout_step(threads),
+            rollout_step(threads, thread_affinity_offset=0),
         ),
     }
 
 
-def main(threads: int = 2, rounds: int = 15, seconds: float = 0.1) -> None:
-    """Compares every pair.
-
-    Args:
-        threads: torch's threads.
-        rounds: pairs of measurements.
-        seconds: time that one measurement repeats its form for, at least once.
-    """
-    torch.set_num_threads(threads)
-    tell(f"torch {torch.__version__}, {torch.backends.cpu.get_cpu_capability()}, {threads} threads, {rounds} rounds\n")
+def main() -> None:
+    args = parse(Args, description=__doc__)
+    torch.set_num_threads(args.threads)
+    setting = f"{kind_of_processor()}, {args.threads} threads, {args.rounds} rounds"
+    tell(f"torch {torch.__version__}, {setting}\n")
     tell("| trick | plain, ms | trick, ms | plain / trick (quartiles) |\n|-|-|-|-|")
-    for name, pair in tricks().items():
+    for name, pair in tricks(args.threads).items():
         measured = []
-        for _ in range(rounds + 1):
-            measured.append([time_of(form, seconds) for form in pair])
+        for _ in range(args.rounds + 1):
+            measured.append([time_of(form, args.seconds) for form in pair])
         plain, trick = zip(*measured[1:])  # the first round warms up
         ratios = [a / b for a, b in zip(plain, trick)]
         low, _, high = quantiles(ratios, n=4)
@@ -166,4 +174,4 @@ def time_of(form: Callable, seconds: float) -> float:
 
 
 if __name__ == "__main__":
-    parse(main)
+    main()

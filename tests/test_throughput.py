@@ -198,6 +198,7 @@ def test_the_readme_s_table_compares_within_a_round_of_a_call_alone(tmp_path):
         ("1", 2, "ppo_atari.py"): 200,
         ("1", 2, "CleanRL"): 200,
         ("1", 1, "ppo_atari.py, changed"): 999,
+        ("2", 1, "ppo_atari.py"): 150,
         ("2", 1, "ppo_atari.py --bf16"): 900,
         ("2", 1, "Stable-Baselines3 2.9.2"): 300,
     }
@@ -207,7 +208,14 @@ def test_the_readme_s_table_compares_within_a_round_of_a_call_alone(tmp_path):
     ]
     throughput.add_rows(tmp_path / "throughput_new.csv", rows)
     assert cells(throughput.readme_table(tmp_path))[2:4] == [
-        ["A chip, NEW", "`ppo_atari.py`", "250 (200 to 300)", "2.00 (1.00 to 3.00)", "–", "500 (500 to 500)"],
+        [
+            "A chip, NEW",
+            "`ppo_atari.py`",
+            "250 (200 to 300); 150 (150 to 150)",
+            "2.00 (1.00 to 3.00)",
+            "0.50 (0.50 to 0.50)",
+            "500 (500 to 500); 500 (500 to 500)",
+        ],
         [
             "A chip, NEW",
             "`ppo_atari.py --bf16`",

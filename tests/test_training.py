@@ -206,6 +206,24 @@ def test_the_first_minibatch_is_fitted_to_the_rollout_itself(script, tmp_path, m
     assert values(normalised, "losses/policy_loss") == pytest.approx([0], abs=1e-5)
 
 
+def test_the_loss_is_the_weighted_sum_of_its_parts(script, tmp_path, monkeypatch):
+    """In the first minibatch, whose policy is the new network's; whatever the surrogate and the value loss are."""
+    weights = {"vf_coef": 0.7, "ent_coef": 0.3}
+    torch.manual_seed(1)
+    before = script.Agent((4,), 2)
+    rollout = Recorder(monkeypatch, script, "act")
+    objective, fit = Recorder(monkeypatch, script, "surrogate"), Recorder(monkeypatch, script, "value_loss")
+    losses, backward = [], torch.Tensor.backward
+    monkeypatch.setattr(torch.Tensor, "backward", lambda loss: losses.append(loss.item()) or backward(loss))
+    train(script, tmp_path, **{**ONE_ROLLOUT, "num_minibatches": 1, "update_epochs": 1}, norm_adv=False, **weights)
+    policy = log_softmax(before(torch.cat([given[1] for given, _ in rollout.calls]))[0])
+    entropy = -(np.exp(policy) * policy).sum(1).mean()
+    expected = -objective.calls[0][1].mean().item() + 0.7 * fit.calls[0][1].item() - 0.3 * entropy
+    assert fit.calls[0][1] > 0.1 and entropy > 0.1
+    why = "if a further term is the script's idea, leave this test out by --deselect"
+    assert losses == [pytest.approx(expected, rel=1e-4)], why
+
+
 def test_every_epoch_takes_every_sample_once_in_an_order_of_its_own(script, tmp_path, monkeypatch):
     objective = Recorder(monkeypatch, script, "surrogate")
     train(script, tmp_path, norm_adv=False, **ONE_ROLLOUT)
@@ -366,16 +384,21 @@ def test_every_action_is_chosen_on_the_observation_before_it(script, tmp_path, m
 
 
 def test_a_target_kl_is_held_against_the_mean_over_an_epoch(script, tmp_path, monkeypatch):
-    """The target lies between that mean and the KL of the epoch's last minibatch, which here are far apart."""
+    """The target lies between that mean and the KL of the epoch's last minibatch, of a seed that has them far apart."""
     objective = Recorder(monkeypatch, script, "surrogate")
     arguments = {**CARTPOLE, "total_timesteps": 128, "learning_rate": 0.01}
-    train(script, tmp_path / "far", **arguments)
-    ratios = [given[0] for given, _ in objective.calls[:4]]
-    kls = [(ratio - 1 - ratio.log()).mean().item() for ratio in ratios]
-    mean, last = np.mean(kls), kls[-1]
-    assert abs(mean - last) > 0.2 * mean
+    for seed in range(1, 21):
+        objective.calls.clear()
+        train(script, tmp_path / f"far {seed}", seed=seed, **arguments)
+        ratios = [given[0] for given, _ in objective.calls[:4]]
+        kls = [(ratio - 1 - ratio.log()).mean().item() for ratio in ratios]
+        mean, last = np.mean(kls), kls[-1]
+        if abs(mean - last) > 0.2 * mean:
+            break
+    else:
+        pytest.fail("no seed of 20 has the two apart")
     objective.calls.clear()
-    train(script, tmp_path / "between", target_kl=(mean + last) / 2, **arguments)
+    train(script, tmp_path / "between", target_kl=(mean + last) / 2, seed=seed, **arguments)
     assert (len(objective.calls) == 4) == (mean > last)
 
 

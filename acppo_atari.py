@@ -196,11 +196,11 @@ class Agent(nn.Module):
 
     def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
         """Maps observations, uint8 (B, 84, 84, 4) or float32 (B, D), to logits (B, A) and values (B,)."""
-        # A channels-last view: a gradient step takes 114 ms, 153 in torch's own layout (benchmark/tricks.py)
+        # A channels-last view: in torch's own layout a gradient step takes 1.2 times as long (benchmark/tricks.py)
         x = obs.movedim(-1, 1)
         if obs.dtype == torch.uint8:
             # Straight to the trunk's precision: bfloat16 holds 0 to 255 exactly, so the quotient is rounded once
-            # either way. In place, which takes 2.2 ms for a minibatch, and x / 255 takes 3.2
+            # either way. In place: x / 255 takes 1.6 times as long
             x = x.to(torch.bfloat16 if self.bf16 else torch.float32).div_(255.0)
         with torch.autocast(x.device.type, torch.bfloat16, enabled=self.bf16):  # only the trunk: ratios need float32
             hidden = self.network(x).float()
@@ -233,7 +233,7 @@ def from_envs(array: np.ndarray, device: torch.device) -> Tensor:
 def act(agent: nn.Module, obs: Tensor, generator: torch.Generator | None = None) -> tuple[Tensor, Tensor, Tensor]:
     """Samples actions (B,) and returns them with the log-probabilities of all actions (B, A) and the values (B,)."""
     logits, values = agent(obs)
-    logprobs = logits.log_softmax(-1)  # not a Categorical, which takes 1.8 times as long
+    logprobs = logits.log_softmax(-1)  # not a Categorical, which takes 1.7 times as long
     return torch.multinomial(logprobs.exp(), 1, generator=generator).squeeze(-1), logprobs, values
 
 
@@ -342,7 +342,7 @@ def train(
     torch.set_num_threads(args.threads)
     agent = make_agent(args, envs)
     device = next(agent.parameters()).device
-    # eps as in OpenAI's baselines, not torch's 1e-8; fused: 1.3 ms a step, not 5.7 (benchmark/tricks.py)
+    # eps as in OpenAI's baselines, not torch's 1e-8; fused: a quarter of the time (benchmark/tricks.py)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     iterations_done = run.start(args, state, agent, optimizer)
     run.save(args, iterations_done, agent, optimizer)  # to be resumed from at once; counts this start
@@ -409,7 +409,7 @@ def train(
         minibatch_stats = []  # tensors, read once an iteration: .item() in here would wait for the device
         for _ in range(args.update_epochs):
             for mb_inds in torch.randperm(args.batch_size, device=device).split(args.minibatch_size):
-                # index_select copies whole screens: 0.2 ms; b_obs[mb_inds] takes 3.3 ms
+                # index_select copies whole screens; b_obs[mb_inds] takes ten times as long
                 logits, new_values = agent(b_obs.index_select(0, mb_inds))
                 new_logprobs = logits.log_softmax(-1)
                 logratio = (new_logprobs - b_logprobs[mb_inds]).gather(1, b_actions[mb_inds, None]).squeeze(1)

@@ -364,7 +364,7 @@ def limits_table(rows: list[Row], limits: dict[tuple[int, int], dict[str, float]
 
 
 def columns_of(name: str, rounds: list[dict[str, dict]]) -> dict[str, list[float]]:
-    """Returns the README's columns for a script: its values in the rounds (contender → row) of one call that have it."""
+    """Returns the README's columns for a script: its values in the rounds (contender → row) of a call that have it."""
     columns = {"steps/s": [], "× CleanRL": [], "× Stable-Baselines3": [], "peak MB": []}
     for rows in (rows for rows in rounds if name in rows):
         speed = float(rows[name]["steps_per_second"])

@@ -384,18 +384,18 @@ def readme_table(directory: Path = RESULTS) -> str:
     table, settings = [], {}
     for path in sorted(directory.glob("throughput_*.csv")):
         calls: dict[str, dict[str, dict[str, dict]]] = {}  # call → round → contender → its row
-        for row in read_csv(path)[1]:
+        for row in (rows := read_csv(path)[1]):
             calls.setdefault(row.get("call"), {}).setdefault(row["round"], {})[row["contender"]] = row
-        kind = row.get("kind") or path.stem.removeprefix("throughput_").upper()  # older rows have none
+        kind = rows[0].get("kind") or path.stem.removeprefix("throughput_").upper()  # older rows have none
         for name in IN_README:
-            line = {"processor": f"{row['cpu']}, {kind}", "script": f"`{name}`"}
+            line = {"processor": f"{rows[0]['cpu']}, {kind}", "script": f"`{name}`"}
             of_calls = [columns_of(name, list(call.values())) for call in calls.values()]
             for column in of_calls[0]:
                 digits = 2 if column.startswith("×") else 0
                 line[column] = "; ".join(spread(call[column], digits) for call in of_calls if call[column]) or "–"
             if line["steps/s"] != "–":
                 table.append(line)
-                settings["{env_id}, {num_envs} environments, {threads} threads, torch {torch}".format(**row)] = None
+                settings["{env_id}, {num_envs} environments, {threads} threads, torch {torch}".format(**rows[0])] = None
     said = f"{'; '.join(settings)}: median (minimum to maximum) over the rounds of a call; calls side by side. "
     said += "A round runs each script once; a ratio is taken within one."
     return markdown(list(table[0]), [list(line.values()) for line in table]) + f"\n{said}\n"

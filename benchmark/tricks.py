@@ -3,7 +3,7 @@
     python benchmark/tricks.py --threads 2
 
 Prints a table: milliseconds of each form (median) and the median of the pairwise ratios with its quartiles. Sizes are
-those of the thesis: minibatches of 256 screens for the update, 8 screens for a step of the rollout. Takes two minutes.
+those of the thesis: minibatches of 256 screens for the update, 8 screens for a step of the rollout. Takes a minute.
 """
 
 import sys

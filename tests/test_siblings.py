@@ -3,7 +3,10 @@
 Other siblings, which `--script` names, are imported from anywhere, or refused.
 """
 
+import ast
+import dataclasses
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -46,6 +49,23 @@ def test_the_readme_shows_the_diff_as_it_is():
     shown = readme.split("<!-- sibling diff -->\n```diff\n")[1].split("\n```\n<!-- end -->")[0]
     diff = [line for line in code_diff(PPO, ACPPO) if not line.startswith("@@")]
     assert [line for line in shown.splitlines() if line] == diff
+
+
+def test_every_argument_is_read_by_the_script_or_a_file_beside_it(each_script):
+    """A flag that nothing reads would be accepted, logged, and change nothing."""
+    own = Path(each_script.__file__)
+    imported = {
+        getattr(value, "__module__", None) or getattr(value, "__name__", "") for value in vars(each_script).values()
+    }
+    files = {Path(getattr(sys.modules.get(name), "__file__", None) or own) for name in imported}
+    read = {
+        node.attr
+        for file in files
+        if file.parent in (own.parent, ROOT)
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Attribute)
+    }
+    assert {field.name for field in dataclasses.fields(each_script.Args)} <= read
 
 
 @pytest.mark.parametrize(

@@ -85,6 +85,16 @@ class Stage:
     def final(self) -> bool:
         return self.name == "finished"
 
+    @property
+    def schedules(self) -> dict[Key, int]:
+        """The agent steps of each run's whole schedule."""
+        return dict(zip(self.runs[KEY].itertuples(index=False, name=None), self.runs.total_timesteps))
+
+    @property
+    def long(self) -> bool:
+        """Whether all have done half of their schedules, so that the course of each says something."""
+        return all(curve.index[-1] >= self.schedules[key] / 2 for key, curve in self.compared.items())
+
     def words(self) -> dict[str, str]:
         """Returns what the texts call the two variants, and what the clip ratio is to be near to."""
         base, new = (SPELLED.get(variant, variant) for variant in (self.baseline, self.challenger))
@@ -376,16 +386,21 @@ def claims_table(stage: Stage) -> str:
     return markdown(["claim", *games(stage.compared), "across games"], table)
 
 
-def progress_table(curves: Curves, parts: int = 10) -> str:
-    """Each run's score at the end of each tenth of its iterations, and its mean KL in that tenth."""
+def progress_table(stage: Stage, parts: int = 10) -> str:
+    """Each run's score at the end of each tenth of its schedule, and its mean KL in that tenth, as far as it got."""
     table = []
-    for (variant, game, seed), curve in curves.items():
-        tenths = [curve.iloc[len(curve) * i // parts : len(curve) * (i + 1) // parts] for i in range(parts)]
+    for (variant, game, seed), curve in stage.compared.items():
+        batch_size = curve.index[0]
+        rollouts = stage.schedules[variant, game, seed] // batch_size
+        ends = [rollouts * i // parts * batch_size for i in range(parts + 1)]
+        tenths = [
+            curve.loc[start + 1 : end if curve.index[-1] >= end else start] for start, end in itertools.pairwise(ends)
+        ]
         scores, kls = [tenth.mean_return_100.tail(1).mean() for tenth in tenths], [tenth.kl.mean() for tenth in tenths]
         for name, numbers, form in (("score", scores, ",.0f"), ("KL", kls, ".2g")):
             cells = [f"{number:{form}}" if math.isfinite(number) else "–" for number in numbers]
             table.append([f"{game} {variant} {seed}", name, *cells])
-    return markdown(["run", "of the run", *(f"{100 * (i + 1) // parts} %" for i in range(parts))], table)
+    return markdown(["run", "of the schedule", *(f"{100 * (i + 1) // parts} %" for i in range(parts))], table)
 
 
 def spikes_table(curves: Curves, most: int = 10) -> str:

@@ -245,8 +245,7 @@ def bf16_note(runs: pd.DataFrame) -> str:
 def coverage(stage: Stage) -> str:
     """Says which runs a stage is made of, and how much of their schedule they have done."""
     runs = stage.runs
-    totals = dict(zip(runs[KEY].itertuples(index=False, name=None), runs.total_timesteps))
-    done = [100 * curve.index[-1] / totals[key] for key, curve in stage.drawn.items()]
+    done = [100 * curve.index[-1] / stage.schedules[key] for key, curve in stage.drawn.items()]
     share = " to ".join(dict.fromkeys(f"{percent:.3g} %" for percent in (min(done), max(done))))
     names = {name: ", ".join(map(str, sorted(runs[name].unique()))) for name in KEY}
     commits = sorted({commit[:7] for of_run in runs.commit for commit in of_run.split("; ")})
@@ -274,7 +273,8 @@ def stage_tables(stage: Stage) -> dict[str, str]:
     judged = [kl_table(stage), claims_table(stage)]
     if stage.final:
         scores += [evaluation_table(stage.runs), human_table(stage)]
-        judged += [progress_table(stage.compared), spikes_table(stage.compared)]
+    if stage.long:
+        judged += [progress_table(stage), spikes_table(stage.compared)]
     return {"score": "\n".join(filter(None, scores)), "kl": "\n".join(judged)}
 
 

@@ -292,12 +292,24 @@ def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have(tmp_path):
     assert rows[0][2:8] == ["2", "102,400", "1.4", "1", "9", "9"]
 
 
-def test_progress_is_told_in_tenths_of_a_run(tmp_path):
+def test_progress_is_told_in_tenths_of_the_schedule(tmp_path):
     columns = {"mean_return_100": range(1000, 1020), "kl": [1, 3] * 9 + [4, 6]}
     (stage,) = make_stages(tmp_path, {("ppo", "Pong", 1): columns})
-    header, _, score, kl = cells(claims.progress_table(stage.compared))
+    header, _, score, kl = cells(claims.progress_table(stage))
     assert (header[2], header[-1]) == ("10 %", "100 %")
     assert score[1:4] == ["score", "1,001", "1,003"] and kl[1:] == ["KL", *["2"] * 9, "5"]
+
+
+@pytest.mark.parametrize(("schedule", "told"), [(38, True), (40, True), (42, False)])
+def test_progress_and_largest_kls_are_told_once_all_have_done_half_of_their_schedules(schedule, told, tmp_path):
+    runs = {("ppo", "Pong", 1): {"mean_return_100": [7] * 19 + [8], "kl": 1}, ("acppo", "Pong", 1): {"kl": [1] * 20}}
+    (stage,) = make_stages(tmp_path, runs, iterations=schedule)
+    table = figures.stage_tables(stage)["kl"]
+    assert not stage.final and ("of the schedule" in table) == ("× median" in table) == told
+    score, kl = cells(claims.progress_table(stage))[2:4]
+    rest = ["–"] * (5 if told else 6)  # a tenth that has not ended is left out, too
+    assert score[1:] == ["score", *["7"] * (9 - len(rest)), "8" if schedule == 40 else "7", *rest]
+    assert kl[1:] == ["KL", *["1"] * (10 - len(rest)), *rest]
 
 
 def test_the_largest_kls_stand_beside_what_else_their_iteration_had(tmp_path):

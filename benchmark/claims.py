@@ -86,14 +86,10 @@ class Stage:
         return self.name == "finished"
 
     @property
-    def schedules(self) -> dict[Key, int]:
-        """The agent steps of each run's whole schedule."""
-        return dict(zip(self.runs[KEY].itertuples(index=False, name=None), self.runs.total_timesteps))
-
-    @property
     def long(self) -> bool:
         """Whether all have done half of their schedules, so that the course of each says something."""
-        return all(curve.index[-1] >= self.schedules[key] / 2 for key, curve in self.compared.items())
+        totals = total_timesteps(self.runs)
+        return all(curve.index[-1] >= totals[key] / 2 for key, curve in self.compared.items())
 
     def words(self) -> dict[str, str]:
         """Returns what the texts call the two variants, and what the clip ratio is to be near to."""
@@ -107,9 +103,9 @@ class Stage:
 
 def make_stages(runs: pd.DataFrame, curves: pd.DataFrame, baseline="ppo", challenger="acppo") -> list[Stage]:
     """Returns the stages that have runs, the finished one first."""
-    schedules = {tuple(key): total for *key, total in runs[[*KEY, "total_timesteps"]].itertuples(index=False)}
+    totals = total_timesteps(runs)
     everything = {key: rows.set_index("step").drop(columns=KEY) for key, rows in curves.groupby(KEY)}
-    finished = {key for key, curve in everything.items() if curve.index[-1] >= FINISHED * schedules[key]}
+    finished = {key for key, curve in everything.items() if curve.index[-1] >= FINISHED * totals[key]}
     finals = [{key: everything[key] for key in finished if key[1] == game} for game in games(everything)]
     beginnings, compared = [], []
     for game in games(everything):
@@ -130,6 +126,11 @@ def make_stages(runs: pd.DataFrame, curves: pd.DataFrame, baseline="ppo", challe
             epsilon = epsilons(runs).get(baseline, math.nan)
             stages.append(Stage(name, rows, together, in_order(cut), baseline, challenger, epsilon))
     return stages
+
+
+def total_timesteps(runs: pd.DataFrame) -> dict[Key, int]:
+    """The agent steps of each run's whole schedule."""
+    return dict(zip(runs[KEY].itertuples(index=False, name=None), runs.total_timesteps))
 
 
 def in_order(curves: Curves) -> Curves:
@@ -388,10 +389,10 @@ def claims_table(stage: Stage) -> str:
 
 def progress_table(stage: Stage, parts: int = 10) -> str:
     """Each run's score at the end of each tenth of its schedule, and its mean KL in that tenth, as far as it got."""
-    table = []
+    table, totals = [], total_timesteps(stage.runs)
     for (variant, game, seed), curve in stage.compared.items():
         batch_size = curve.index[0]
-        rollouts = stage.schedules[variant, game, seed] // batch_size
+        rollouts = totals[variant, game, seed] // batch_size
         ends = [rollouts * i // parts * batch_size for i in range(parts + 1)]
         tenths = [
             curve.loc[start + 1 : end if curve.index[-1] >= end else start] for start, end in itertools.pairwise(ends)

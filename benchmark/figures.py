@@ -54,6 +54,7 @@ from benchmark.claims import (
     seeds,
     short_table,
     spikes_table,
+    total_timesteps,
     variants,
 )
 from benchmark.collect import DEFAULT_OUT, KEY, ROOT, read_grid
@@ -244,8 +245,8 @@ def bf16_note(runs: pd.DataFrame) -> str:
 
 def coverage(stage: Stage) -> str:
     """Says which runs a stage is made of, and how much of their schedule they have done."""
-    runs = stage.runs
-    done = [100 * curve.index[-1] / stage.schedules[key] for key, curve in stage.drawn.items()]
+    runs, totals = stage.runs, total_timesteps(stage.runs)
+    done = [100 * curve.index[-1] / totals[key] for key, curve in stage.drawn.items()]
     share = " to ".join(dict.fromkeys(f"{percent:.3g} %" for percent in (min(done), max(done))))
     names = {name: ", ".join(map(str, sorted(runs[name].unique()))) for name in KEY}
     commits = sorted({commit[:7] for of_run in runs.commit for commit in of_run.split("; ")})

@@ -190,6 +190,11 @@ def tune_process() -> None:
         libc.mallopt(-1, 1 << 30)
         if not libc.mallopt(-3, 1 << 30):
             libc.mallopt(-3, 1 << 25)  # the most that an older glibc takes
+    import torch
+
+    # Adam's moments of dead units shrink to denormal numbers, at 150 cycles each: late in a run gradient clipping and a
+    # step take 2 to 4 times as long (benchmark/tricks.py). Now, because torch's threads inherit this at their start
+    torch.set_flush_denormal(True)
 
 
 # --------------------------------------------------------------------------------------------- bounds of arguments

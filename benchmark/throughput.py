@@ -3,6 +3,7 @@
     python benchmark/throughput.py ppo_atari.py acppo_atari.py
     python benchmark/throughput.py ppo_atari.py "ppo_atari.py --bf16" --peer --cleanrl ../cleanrl
     python benchmark/throughput.py ppo_atari.py --jobs 1 2
+    python benchmark/throughput.py ppo_atari.py "ppo_atari.py --resume runs/Breakout__ppo_atari__1__1700000000"
     python benchmark/throughput.py ppo_atari.py --num-envs 8 16 32 64 --threads 1 2
     python benchmark/throughput.py --table
 
@@ -10,7 +11,8 @@ A contender is a script with its flags, in one string. Each run is a whole proce
 is read from what it logged. Runs are interleaved, A B A B, and compared round by round: a machine whose speed drifts
 by 20 % moves both sides of a ratio alike, and the same script given twice shows how much noise is left. With
 `--jobs 2` a contender runs as two processes that share the threads, and their steps/s add up over the time in which
-both are past their warm-up.
+both are past their warm-up. With `--resume` a contender goes on from a copy of that run's checkpoint, for the speed of
+the end of a run.
 
 Standard output gets three tables: speed; where an iteration's time goes; and how far each run is from two limits
 measured just before, the convolutions that the processor can compute and the steps that the bare emulator can make.
@@ -149,6 +151,8 @@ class Contender:
     torch: str  # version
     peer: bool = False
     environment: dict[str, str] = field(default_factory=dict)  # on top of this program's
+    checkpoint: Path | None = None  # each run goes on from a copy of it
+    first_step: int = 0  # agent steps that the checkpoint has done
 
 
 def make_contenders(args: Args) -> list[Contender]:
@@ -169,6 +173,12 @@ def make_contenders(args: Args) -> list[Contender]:
         command = (sys.executable, script, *flags, "--env-id", args.env_id)
         name = f"{given} ({repeat + 1})" if repeat else given
         contenders.append(Contender(name, command, commit_of(str(path), str(path.parent)), torch))
+        if "--resume" in flags[:-1]:
+            contenders[-1].checkpoint = Path(flags[flags.index("--resume") + 1]) / "checkpoint.pt"
+            try:
+                contenders[-1].first_step = in_own_process(steps_done, contenders[-1].checkpoint)
+            except Exception as error:  # a file that is no checkpoint can make torch raise anything
+                refuse(repr(given), f"no checkpoint can be read there ({type(error).__name__})")
     if args.peer:
         try:
             version = importlib.metadata.version("stable-baselines3")
@@ -190,6 +200,13 @@ def make_contenders(args: Args) -> list[Contender]:
         commit = commit_of(str(script), str(script.parent))
         contenders.append(Contender("CleanRL", command, commit, torch, True, environment))
     return contenders
+
+
+def steps_done(checkpoint: Path) -> int:
+    """Returns the agent steps of a run up to its checkpoint."""
+    import torch
+
+    return torch.load(checkpoint, weights_only=True)["global_step"]
 
 
 # --------------------------------------------------------------------------------------------- runs and their logs
@@ -261,12 +278,17 @@ def run_process(row: Row, needed: int, directory: Path) -> tuple[list[Iteration]
     """Runs one job for `needed` iterations, and returns them with the measurements of the whole process."""
     contender, threads = row.contender, str(max(1, row.threads // row.jobs))
     command = [*contender.command, "--num-envs", str(row.num_envs)]
-    command += ["--total-timesteps", str(row.num_envs * NUM_STEPS * needed)]
+    command += ["--total-timesteps", str(contender.first_step + row.num_envs * NUM_STEPS * needed)]
     environment = {**os.environ, "CUDA_VISIBLE_DEVICES": "", **contender.environment}
     if contender.peer:  # has no flags for these: torch reads its threads here, and `runs` is in the working directory
         environment |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
     else:
-        command += ["--threads", threads, "--log-dir", str(directory)]
+        command += ["--threads", threads]
+        command += ["--eval-episodes", "0"] if contender.checkpoint else ["--log-dir", str(directory)]
+    if contender.checkpoint:
+        (directory / "run").mkdir()
+        shutil.copy(contender.checkpoint, directory / "run")
+        command[command.index("--resume") + 1] = str(directory / "run")
     place = {"cwd": directory if contender.peer else None, "env": environment}
     with (directory / "stderr").open("w+", encoding="utf-8", errors="replace") as stderr:
         started = time.time()

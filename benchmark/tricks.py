@@ -6,6 +6,7 @@ Prints a table: milliseconds of each form (median) and the median of the pairwis
 those of the thesis: minibatches of 256 screens for the update, 8 screens for a step of the rollout. Takes a minute.
 """
 
+import copy
 import sys
 import time
 from collections.abc import Callable
@@ -74,10 +75,46 @@ def optimizer_step(fused: bool) -> Callable:
     return torch.optim.Adam(network.parameters(), lr=1e-9, fused=fused).step
 
 
+def late_optimizer_step(flush: bool) -> Callable:
+    """Returns gradient clipping and a step of Adam as late in a run: an eighth of the first moments is denormal.
+
+    Those belong to dead units. They are 4 units of the last place, which 0.9 times 4 is rounded to again. Runs in a
+    thread of its own, because the setting belongs to a thread and to those that it starts.
+    """
+    network, thread = nature_cnn(), ThreadPoolExecutor(1, initializer=torch.set_flush_denormal, initargs=(flush,))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-9, fused=True)
+
+    def prepare():
+        network(torch.rand(2, 4, 84, 84)).sum().backward()
+        optimizer.step()
+        for parameter in network.parameters():
+            dead = parameter.numel() // 8
+            parameter.grad.view(-1)[:dead] = 0
+            optimizer.state[parameter]["exp_avg"].view(-1)[:dead] = 4 * 2.0**-149
+
+    def run():
+        nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+        optimizer.step()
+
+    thread.submit(prepare).result()
+    return lambda: thread.submit(run).result()
+
+
 def forward(network: nn.Module, screens: torch.Tensor, mode: Callable) -> Callable:
     def run():
         with mode():
             network(screens.float().div_(255.0))
+
+    return run
+
+
+def forward_bf16(network: nn.Module, screens: torch.Tensor) -> Callable:
+    """Returns a step of the network under `--bf16`; a network that is in bfloat16 already is not cast."""
+
+    @torch.inference_mode()
+    def run():
+        with torch.autocast("cpu", torch.bfloat16):
+            network(screens.to(torch.bfloat16).div_(255.0))
 
     return run
 
@@ -121,6 +158,7 @@ def tricks(threads: int) -> dict[str, tuple[Callable, Callable]]:
         "update: 512-unit layer as a 7×7 convolution (refused)": (update(channels_last, last), update(convolved, last)),
         "update: ReLU in place": (update(out_of_place, last), update(channels_last, last)),
         "update: fused Adam": (optimizer_step(fused=False), optimizer_step(fused=True)),
+        "update: denormal numbers flushed to 0, late in a run": (late_optimizer_step(False), late_optimizer_step(True)),
         "minibatch: index_select for obs[indices]": (lambda: nhwc[chosen], lambda: nhwc.index_select(0, chosen)),
         "minibatch: .float().div_(255) for / 255": (lambda: last / 255.0, lambda: last.float().div_(255.0)),
         "update, bfloat16: screens cast to it at once, not by way of float32": (
@@ -130,6 +168,10 @@ def tricks(threads: int) -> dict[str, tuple[Callable, Callable]]:
         "rollout: inference_mode for no_grad": (
             forward(channels_last, last[:NUM_ENVS], torch.no_grad),
             forward(channels_last, last[:NUM_ENVS], torch.inference_mode),
+        ),
+        "rollout, bfloat16: weights cast once, not at each step": (
+            forward_bf16(channels_last, last[:NUM_ENVS]),
+            forward_bf16(copy.deepcopy(channels_last).bfloat16(), last[:NUM_ENVS]),
         ),
         "rollout: multinomial for Categorical": (
             lambda: Categorical(logits=logits).sample(),

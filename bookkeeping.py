@@ -8,6 +8,7 @@ that is passed in as a function, so this file knows no network and no loss.
 `benchmark/` uses the small helpers at the top. They cost no torch: it is imported in the functions that need it.
 """
 
+import ast
 import contextlib
 import csv
 import ctypes
@@ -28,6 +29,7 @@ import signal
 import subprocess
 import sys
 import time
+import tokenize
 import typing
 import zipfile
 from collections import deque
@@ -35,7 +37,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import filelock
 import numpy as np
@@ -195,6 +197,58 @@ def tune_process() -> None:
     # Adam's moments of dead units shrink to denormal numbers, at 150 cycles each: late in a run gradient clipping and a
     # step take 2 to 4 times as long (benchmark/tricks.py). Now, because torch's threads inherit this at their start
     torch.set_flush_denormal(True)
+
+
+def code_lines(script: str | os.PathLike) -> list[str]:
+    """Returns a script's lines without docstrings, comments and blank lines."""
+    with tokenize.open(script) as file:
+        source = file.read()
+    lines = source.splitlines()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            lines[token.start[0] - 1] = lines[token.start[0] - 1][: token.start[1]]
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            lines[node.lineno - 1 : node.end_lineno] = [""] * (node.end_lineno - node.lineno + 1)
+    return [line.rstrip() for line in lines if line.strip()]
+
+
+def code_hash(script: str | os.PathLike) -> str:
+    """Returns a hash of what a script does: of its code, so that another comment makes no other script."""
+    return f"sha256 {hashlib.sha256(chr(10).join(code_lines(script)).encode()).hexdigest()}"
+
+
+class Progress(NamedTuple):
+    """How far a run is. As text it is the status line, which `find` reads again."""
+
+    step: int  # agent steps done
+    last_step: int  # with which this call ends
+    steps_per_second: float
+    score: float | None  # mean of the last 100 games
+
+    def __str__(self) -> str:
+        left = timedelta(seconds=int((self.last_step - self.step) / self.steps_per_second))
+        score = "" if self.score is None else f", score {self.score:.1f}"
+        return f"step {self.step:,} of {self.last_step:,}, {self.steps_per_second:.0f} SPS{score}, {left} left"
+
+    @classmethod
+    def find(cls, text: str) -> "Progress | None":
+        """Returns the last status line in a text."""
+        lines = re.findall(r"step ([\d,]+) of ([\d,]+), (\d+) SPS(?:, score (-?[\d.]+))?", text)
+        if not lines:
+            return None
+        step, last_step, speed, score = lines[-1]
+        return cls(
+            int(step.replace(",", "")), int(last_step.replace(",", "")), float(speed), float(score) if score else None
+        )
+
+
+def write_file(path: str | os.PathLike, data: str | bytes) -> None:
+    """Replaces a file, text as UTF-8: writes a new one beside it and renames that. One of the two is always whole.
+
+    Raises OSError, with the file's name in it.
+    """
+    write_bytes(path, data.encode() if isinstance(data, str) else data)
 
 
 # --------------------------------------------------------------------------------------------- bounds of arguments
@@ -786,3 +840,7 @@ def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: Stop
         say(f"At --stop-at; go on with: {call_of(args, '--resume', path)}")
     cut_short = wanted or not done or run.films_cut_short
     sys.exit(128 + stop.number if stop.number and cut_short else 1 if run.not_written else 0)
+
+
+# Temporary: both names until the programs of benchmark/ use the new ones
+usage_error, processor_kind, git_commit, check_bounds = refuse, kind_of_processor, commit_of, check

@@ -6,26 +6,22 @@ It differs from ppo_atari.py in this text, the arguments clip_coef and c, clip_r
     python acppo_atari.py --env-id Breakout --c 1.0
     tensorboard --logdir runs
 
-8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (the README has measured speeds).
-Scores, losses and how far each update moved the policy go to TensorBoard; the README defines every curve. A stopped or
-killed run goes on with `--resume`. ppo_atari.py and acppo_atari.py are siblings: every change goes into both, so that
-their diff stays AC-PPO alone. wrappers.py has the environments; bookkeeping.py has checkpoints, logging, signals,
-evaluation and videos.
+8 games at once, 5,000,000 agent steps = 20,000,000 emulator frames: hours on a CPU (docs/speed.md has measured speeds).
+Scores, losses and how far each update moved the policy go to TensorBoard; docs/curves.md defines every curve, and
+docs/thesis.md has the equations. `--resume` continues a stopped or killed run. ppo_atari.py and acppo_atari.py are
+siblings: every change goes into both, so that their diff is AC-PPO and nothing else. wrappers.py has the environments;
+bookkeeping.py has checkpoints, logging, signals, evaluation and videos.
 
 Sections: arguments, network, mathematics, training, command line.
 """
 
 import copy
 import math
-import os
-import signal
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-
-if __name__ == "__main__" and signal.getsignal(signal.SIGINT) == signal.default_int_handler:
-    signal.signal(signal.SIGINT, lambda number, frame: os._exit(130))  # Ctrl-C ends the imports without a traceback
+from pathlib import Path
 
 import bookkeeping
 
@@ -42,22 +38,20 @@ from bookkeeping import (
     Fraction,
     NonNegativeFloat,
     NonNegativeInt,
-    NonNegativeOrInf,
     PositiveFloat,
     PositiveInt,
+    RunArgs,
     RunDirectory,
     StatusLine,
     StopSignal,
     Stopwatch,
-    Threads,
-    say,
 )
 from wrappers import env_seeds
 
 
 # ---------------------------------------------------------------------------------------------------- arguments
 @dataclass
-class Args:
+class Args(RunArgs):
     env_id: str = "Breakout"
     """the environment: an Atari game by its bare name (thesis protocol), `ALE/Breakout-v5` (the same with sticky
     actions), or a Gymnasium id with discrete actions such as `CartPole-v1`"""
@@ -85,7 +79,7 @@ class Args:
     clip_coef: PositiveFloat = 0.16
     """clip range of the probability ratio at an advantage of 0, ε (chapter 4); with `--c inf`, the bound δ on
     the product of ratio deviation and normalised advantage"""
-    c: NonNegativeOrInf = 1.0
+    c: bookkeeping.NonNegativeOrInf = 1.0
     """weight of the advantage in the clip range ε / (1 + c·|Â|) (section 3.1): 0 is PPO, `inf` the range δ / |Â|, which
     is the thesis's product-only objective"""
     clip_vloss: bool = True
@@ -108,31 +102,11 @@ class Args:
     """have cuDNN choose deterministic algorithms (CleanRL); on one machine's CPU, seed and threads determine the run"""
     cuda: bool = True
     """use a GPU if there is one"""
-    threads: Threads = field(default_factory=bookkeeping.available_cores)
-    """threads of torch; the emulators use as many, in turn with it. The default is the cores that this process may use;
-    in a container with a CPU quota, which it does not see, give the quota"""
     bf16: bool = False
     """run the network's trunk in bfloat16 (ours): faster on processors with AVX512-BF16 or AMX (Linux's `lscpu` lists
     avx512_bf16 or amx_bf16), far slower on others; parameters, logits, values and losses stay float32"""
-    exp_name: FileName = bookkeeping.file_name(__file__)
+    exp_name: FileName = Path(__file__).stem
     """name of the experiment, part of the run's name"""
-    log_dir: str = "runs"
-    """directory that the run's own directory is made in"""
-    checkpoint_minutes: NonNegativeOrInf = 5.0
-    """wall time between two checkpoints; 0 writes one after every iteration"""
-    eval_episodes: NonNegativeInt = 10
-    """whole games that are played and scored when the training is finished, without learning; 0 for none"""
-    capture_video: bool = False
-    """film a whole game, into `videos/` of the run, at the start, at each quarter and at the end of the training; with
-    `--evaluate`, one game"""
-    evaluate: str | None = None
-    """evaluate the checkpoint in this run directory for `--eval-episodes` games, without training"""
-    resume: str | None = None
-    """go on with the run in this directory, with its saved arguments; flags given as well override
-    them, but for game, rollout, seed and names"""
-    stop_at: PositiveInt | None = None
-    """end this call at this many agent steps (rounded up to whole rollouts), with a checkpoint; the schedule stays that
-    of the whole run"""
 
     @property
     def batch_size(self) -> int:
@@ -148,12 +122,6 @@ class Args:
         """Rollouts with their updates in the whole run."""
         return self.total_timesteps // self.batch_size
 
-    @property
-    def last_iteration(self) -> int:
-        """The iteration that this call ends with."""
-        stop_at = self.total_timesteps if self.stop_at is None else self.stop_at
-        return min(self.num_iterations, math.ceil(stop_at / self.batch_size))
-
     def rules(self) -> list[tuple[str, bool, str]]:
         """Returns (argument, does it hold, advice) for each rule that involves several arguments."""
         rollout = f"num_envs · num_steps = {self.batch_size}"
@@ -162,8 +130,7 @@ class Args:
             ("total_timesteps", self.total_timesteps >= self.batch_size, f"give at least one rollout, {rollout}"),
             ("num_minibatches", self.batch_size % self.num_minibatches == 0, f"give a divisor of {rollout}"),
             ("num_minibatches", self.minibatch_size > 1 or not self.norm_adv, "give fewer, or --no-norm-adv"),
-            ("evaluate", self.evaluate is None or self.resume is None, "give either this or --resume"),
-            ("evaluate", self.evaluate is None or self.eval_episodes > 0, "give --eval-episodes above 0, too"),
+            *super().rules(),
         ]
 
 
@@ -251,7 +218,7 @@ def act(agent: nn.Module, obs: Tensor, generator: torch.Generator | None = None)
 
 
 @torch.inference_mode()
-def value_of(agent: nn.Module, obs: Tensor) -> Tensor:
+def get_value(agent: nn.Module, obs: Tensor) -> Tensor:
     """Returns the values (B,) of observations."""
     return agent(obs)[1]
 
@@ -320,7 +287,7 @@ def value_loss(new_values, values, returns, vf_clip_coef: float | None) -> Tenso
 
 
 def policy_change(logprobs, new_logprobs, actions, advantages) -> dict[str, Tensor]:
-    """Measures how far an update moved the policy on the B states of its rollout (the README defines each name).
+    """Measures how far an update moved the policy on the B states of its rollout (docs/curves.md defines each name).
 
     Args: log-probabilities of all actions before and after (B, A), the actions taken (B,), the advantages (B,),
     normalised over the rollout unless `norm_adv` is off. `kl` and the distances are exact over actions; the other three
@@ -401,13 +368,13 @@ def train(
             truncations[t] = torch.from_numpy(truncated)
             if truncated.any():
                 final_obs = np.stack(infos["final_obs"][truncated])  # the other rows are uninitialised memory
-                final_values[t, truncations[t]] = value_of(policy, from_envs(final_obs, device))
+                final_values[t, truncations[t]] = get_value(policy, from_envs(final_obs, device))
             for n in np.flatnonzero(infos.get("_episode", False)):
                 games.append((global_step, float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
             stopwatch.lap("rest")
 
         # Advantages, and the TD(λ) returns that the values are fitted to
-        values[T] = value_of(policy, obs[T])
+        values[T] = get_value(policy, obs[T])
         next_values = torch.where(truncations, final_values, values[1:])
         advantages = compute_gae(
             rewards, values[:T], next_values, terminations, truncations, args.gamma, args.gae_lambda
@@ -499,7 +466,7 @@ def main() -> None:
             run.restore_agent(state, agent)
         bookkeeping.finish(args, partial(make_policy, agent, args.seed), run, stop)
     except FloatingPointError as error:
-        say(f"{run.path}: {error}")
+        bookkeeping.print_message(f"{run.path}: {error}")
         sys.exit(1)
 
 

@@ -9,14 +9,13 @@ game (`SAME_STEP`): with Gymnasium's default, `NEXT_STEP`, every game would be f
 PPO then trains on.
 """
 
-import contextlib
 import difflib
 import importlib.metadata
 import os
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import ale_py
 import gymnasium as gym
@@ -37,7 +36,6 @@ from gymnasium.wrappers import (
 from gymnasium.wrappers.vector import RecordEpisodeStatistics, TransformReward
 
 gym.register_envs(ale_py)
-OWN_IDS = list(gym.registry)  # Gymnasium's and ale-py's; other packages add theirs later
 
 FRAME_SKIP = 4  # emulator frames shown for each agent step
 SCREEN = (84, 84)  # height and width of an observation, pixels
@@ -58,7 +56,7 @@ def make_envs(
         num_envs: the number of copies N.
         num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
         max_frames: emulator frames after which an Atari game is truncated, counted from the end of its no-ops.
-        video: a WebM file that the first game of the first environment is written to, from each `reset` on.
+        video: an MP4 file that the first game of the first environment is written to, from each `reset` on.
 
     Returns:
         A vector environment in `SAME_STEP` autoreset. Observations: uint8 (N, 4, 84, 84) for Atari and other screens,
@@ -150,7 +148,7 @@ class FiniteNumbers(VectorWrapper):
 
 
 class RecordVideo(VectorWrapper):
-    """Writes the first game of the first environment to a WebM file (VP9): in colour, without sound, in real time.
+    """Writes the first game of the first environment to an MP4 file (VP9): in colour, without sound, in real time.
 
     Shows the screens of `twin`, games in lockstep with the agent's, or the environments' own renders. The last screen
     of a game is there only with a twin: others have already been reset when they can be asked.
@@ -166,10 +164,8 @@ class RecordVideo(VectorWrapper):
         screen = self.env.render()[0] if self.twin is None else self.twin.reset(seed=seed, options=options)[0][0, 0]
         import cv2  # here, because it changes the environment variables of whoever imports it
 
-        self.screens, self.shape = 0, screen.shape  # written
-        with silent():  # about a tag that WebM does without
-            vp9 = cv2.VideoWriter_fourcc(*"VP90")
-            self.video = cv2.VideoWriter(self.path, cv2.CAP_FFMPEG, vp9, self.fps, screen.shape[1::-1])
+        vp9 = cv2.VideoWriter_fourcc(*"vp09")
+        self.video = cv2.VideoWriter(self.path, cv2.CAP_FFMPEG, vp9, self.fps, screen.shape[1::-1])
         if not self.video.isOpened():
             raise OSError(f"OpenCV cannot write {self.path}")
         self.write(screen)
@@ -189,46 +185,16 @@ class RecordVideo(VectorWrapper):
 
     def write(self, screen: np.ndarray) -> None:
         if self.video is not None:
-            if np.shape(screen) != self.shape or screen.dtype != np.uint8:  # OpenCV would leave it out
-                raise OSError(f"picture {self.screens} is not one of {self.shape} in uint8 as the first")
-            self.screens += 1
             self.video.write(np.ascontiguousarray(screen[..., ::-1]))  # OpenCV takes blue first
 
     def finish(self) -> None:
-        """Ends the file. Raises OSError if it is not whole, which OpenCV does not say: the disk may be full."""
-        if self.video is None:
-            return
-        self.video.release()
-        self.video = None
-        import cv2
-
-        with silent():
-            file, readable = cv2.VideoCapture(self.path), 0
-            while file.grab():
-                readable += 1
-        if readable != self.screens:
-            raise OSError(f"{self.path} ends after {readable} of {self.screens} pictures")
+        if self.video is not None:
+            self.video.release()
+            self.video = None
 
     def close(self, **kwargs):
         self.finish()
         super().close(**kwargs)
-
-
-@contextlib.contextmanager
-def silent() -> Iterator[None]:
-    """Keeps the prints of C code in its body from standard error."""
-    try:
-        kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
-    except OSError:  # it is closed, and silent anyway
-        yield
-        return
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        os.dup2(kept, 2)
-        os.close(kept)
-        os.close(nowhere)
 
 
 class EpisodicLife(VectorWrapper):
@@ -277,7 +243,7 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
     """
     env_id = env_id.removeprefix("ale_py:")  # as elsewhere, where it has Gymnasium import ale-py
     registered = gym.registry.get(env_id.rpartition(":")[2])
-    if registered is not None and not is_atari(registered):
+    if registered is not None and registered.entry_point != "ale_py.env:AtariEnv":
         return None  # Gymnasium's Blackjack-v1 is not Atari's Blackjack
     if registered is not None and registered.namespace == "ALE":
         return registered.kwargs["game"], registered.kwargs["repeat_action_probability"]
@@ -304,10 +270,6 @@ def canonical_name(env_id: str) -> str:
     return atari_specs()[rom.replace("_", "")].name if repeat_action_probability == 0 else env_id
 
 
-def is_atari(spec: EnvSpec) -> bool:
-    return spec.entry_point == "ale_py.env:AtariEnv"
-
-
 def atari_specs() -> dict[str, EnvSpec]:
     """Returns the games that ale-py registers (`ALE/…-v5`), keyed by name in lower case without underscores.
 
@@ -318,16 +280,12 @@ def atari_specs() -> dict[str, EnvSpec]:
 
 def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) -> VectorEnv:
     """Builds `make_envs`'s vector environment for an id that is not Atari. Raises ValueError as `make_envs` does."""
-    parts = re.fullmatch(r"((?:\w+(?:\.\w+)*:)?)([\w/.-]+)", env_id)
-    if parts is None:
-        raise ValueError(suggest("", env_id))
-    prefix, name = parts.groups()  # "module:" or nothing, and the id
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # "out of date": the id was chosen, or is refused below in one line
-            import_registrations(prefix[:-1], name)
+            import_registrations(env_id)
             envs = gym.make_vec(
-                name,
+                env_id,
                 num_envs,
                 vectorization_mode="sync",
                 vector_kwargs={"autoreset_mode": AutoresetMode.SAME_STEP},
@@ -335,76 +293,40 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
                 **({} if video is None else {"render_mode": "rgb_array"}),
             )
             envs.reset()  # an environment that cannot start is refused here, too
-            if video is not None and (shown := unfit_for_video(envs)):
-                raise ValueError(f"no video can be made of it, it renders {shown}")
+            screen = None if video is None else envs.render()[0]
     except gym.error.UnregisteredEnv as error:
-        raise ValueError(suggest(prefix, name)) from error
-    except Refused:
-        raise
-    except (Exception, SystemExit) as error:  # whatever a foreign constructor raises
+        close = difflib.get_close_matches(env_id.lower(), atari_specs(), n=1)
+        raise ValueError(f"did you mean {atari_specs()[close[0]].name}?" if close else error) from error
+    except (Exception, SystemExit) as error:  # whatever a foreign module or constructor raises
         verb = "built" if video is None else "rendered"
-        reason = str(error).replace("use `", f"use `{prefix}") or type(error).__name__  # Gymnasium, of another version
-        raise ValueError(f"it cannot be {verb}: {reason}") from error
-    if video is not None:
-        envs = RecordVideo(envs, video, float(envs.metadata.get("render_fps") or 30))
+        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}") from error
+    if video is None:
+        return RecordEpisodeStatistics(FiniteNumbers(envs))
+    if not (isinstance(screen, np.ndarray) and screen.dtype == np.uint8 and screen.ndim == 3 and screen.shape[2] == 3):
+        raise ValueError("no video can be made of it: its render is not an array (height, width, 3) of uint8")
+    envs = RecordVideo(envs, video, float(envs.metadata.get("render_fps") or 30))
     return RecordEpisodeStatistics(FiniteNumbers(envs))
 
 
-def unfit_for_video(envs: VectorEnv) -> str:
-    """Says what environments render, if that cannot be filmed."""
-    screen, fps = envs.render()[0], envs.metadata.get("render_fps")
-    if not isinstance(screen, np.ndarray):
-        return f"{type(screen).__name__}, not an array"
-    if screen.dtype != np.uint8 or screen.ndim != 3 or screen.shape[2] != 3 or min(screen.shape) < 2:
-        return f"{screen.dtype} of shape {screen.shape}, not (height, width, 3) in uint8"
-    if not isinstance(fps, int | float | None) or (fps is not None and not 0 < fps < 1000):
-        return f"{fps!r} pictures a second, not a number"
-    return ""
-
-
-class Refused(ValueError):
-    """A module that cannot be imported, or observations or actions that the scripts have no network for."""
-
-
-def import_registrations(module: str, name: str) -> None:
-    """Imports an id's module, if any, and makes the calls that packages declare for registering environments."""
-    if module:
-        if os.getcwd() not in sys.path:
-            sys.path.append(os.getcwd())  # last, so that nothing in it hides a package
-        try:
-            importlib.import_module(module)
-        except (Exception, SystemExit) as error:  # whatever a foreign module raises
-            raise Refused(f"module {module} cannot be imported ({error!r}); install it or start beside it") from error
-    if name not in gym.registry:
-        for call in importlib.metadata.entry_points(group="gymnasium.envs"):  # which Gymnasium made until 1.0
-            if call.module.split(".")[0] == module.split(".")[0] or call.name == name.rpartition("/")[0]:
-                call.load()()
-
-
-def suggest(prefix: str, name: str) -> str:
-    """Says that an id, of a module or none, is unknown, and what to write instead."""
-    games = [] if prefix else [spec.name for spec in atari_specs().values()]
-    own = [] if prefix else [i for i in OWN_IDS if "/" not in i and not is_atari(gym.registry[i])]
-    by_lower = {known.lower(): known for known in [*games, *own, *(i for i in gym.registry if i not in OWN_IDS)]}
-    close = [prefix + by_lower[known] for known in difflib.get_close_matches(name.lower(), by_lower, n=3)]
-    said = f"module {prefix[:-1]} was imported, but registers no {name}" if prefix else "unknown environment"
-    if close:
-        advice = f"did you mean {' or '.join(close)}?"
-    elif prefix:
-        advice = f"if one of its functions does, call that in a module of your own, and use my_module:{name}"
-    else:
-        advice = "use a game such as Breakout, CartPole-v1, or module:Env-v0 for an environment of a module"
-    return f"{said}; {advice}"
+def import_registrations(env_id: str) -> None:
+    """Lets an id's module lie in the current directory, and calls what packages declare to register environments."""
+    if ":" in env_id and os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # last, so that nothing in it hides a package
+    module, _, name = env_id.rpartition(":")
+    for call in importlib.metadata.entry_points(group="gymnasium.envs"):  # which Gymnasium made until 1.0
+        declared = call.module.split(".")[0] == module or call.name == name.rpartition("/")[0]
+        if declared and name not in gym.registry:
+            call.load()()
 
 
 def preprocess(env: gym.Env) -> gym.Env:
     """Turns screens into stacked grey ones, uint8 (4, 84, 84), and all other observations into float32 (D,).
 
-    Raises Refused for observations with a part that is no array of numbers, and for other than `Discrete` actions.
+    Raises ValueError for observations with a part that is no array of numbers, and for other than `Discrete` actions.
     """
     obs_space, action_space = env.observation_space, env.action_space
     if not isinstance(action_space, Discrete):
-        raise Refused(f"its actions are {action_space}; only Discrete actions are supported")
+        raise ValueError(f"its actions are {action_space}; only Discrete actions are supported")
     env = WithoutInfo(env)
     start, dtype = int(action_space.start), action_space.dtype  # the scripts count actions from 0, in int64
     env = TransformAction(env, lambda action: dtype.type(action + start), Discrete(int(action_space.n)))
@@ -412,10 +334,8 @@ def preprocess(env: gym.Env) -> gym.Env:
     shape = obs_space.shape if isinstance(obs_space, Box) and obs_space.dtype == np.uint8 else ()
     is_image = len(shape) == 2 or (len(shape) == 3 and shape[-1] in (1, 3))
     if not is_image or min(shape[:2]) < SMALLEST_SCREEN:  # the small ones are grids of symbols, such as MiniGrid's
-        if refused := list(unsupported_parts(obs_space)):
-            raise Refused(f"its {' and '.join(refused)}, not numbers; register it with a wrapper that leaves this out")
-        if flatdim(obs_space) == 0:
-            raise Refused("its observations are empty")
+        if not is_numeric(obs_space) or flatdim(obs_space) == 0:
+            raise ValueError(f"its observations are {obs_space}, not numbers; a wrapper can leave the rest out")
         flat = Box(-np.inf, np.inf, (flatdim(obs_space),), np.float32)
         return TransformObservation(FlattenObservation(env), to_float32, flat)
     if len(shape) == 3:
@@ -430,10 +350,8 @@ def to_float32(numbers: np.ndarray) -> np.ndarray:
         return np.asarray(numbers, np.float32)
 
 
-def unsupported_parts(space: Space, path: str = "observations") -> Iterator[str]:
-    """Names each part of a space that is no array of numbers: of text, Gymnasium would make character codes."""
+def is_numeric(space: Space) -> bool:
+    """Says whether all parts of a space are arrays of numbers: of text, Gymnasium would make character codes."""
     if isinstance(space, Dict | Tuple):
-        for key, part in space.items() if isinstance(space, Dict) else enumerate(space):
-            yield from unsupported_parts(part, f"{path}[{key!r}]")
-    elif not isinstance(space, Box | Discrete | MultiBinary | MultiDiscrete):
-        yield f"{path} are {type(space).__name__}"
+        return all(map(is_numeric, space.values() if isinstance(space, Dict) else space))
+    return isinstance(space, Box | Discrete | MultiBinary | MultiDiscrete)

@@ -1,22 +1,26 @@
 """Helpers of several test files: the scripts, in this process and in their own, and the logs of a run."""
 
 import contextlib
+import itertools
 import os
 import re
 import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.summary.writer import event_file_writer
 
 import acppo_atari
 import bookkeeping
@@ -43,6 +47,13 @@ def script(request):
 def each_script(request):
     """Both scripts in the plain suite too, for the mathematics and the smoke runs."""
     return request.param
+
+
+@pytest.fixture(autouse=True)
+def event_files_in_order(monkeypatch):
+    """Files of starts within one second, which only a test makes, sort in their order: TensorBoard names them by it."""
+    seconds = itertools.count(int(time.time()) + 1000)
+    monkeypatch.setattr(event_file_writer, "time", SimpleNamespace(time=lambda: next(seconds)))
 
 
 PARAMS = {
@@ -136,6 +147,7 @@ def call_main(monkeypatch, capfd, tmp_path):
 
         with monkeypatch.context() as patch, warnings.catch_warnings(record=True) as shown:
             patch.setattr(bookkeeping, "RunDirectory", RunDirectory)
+            patch.setattr(threading, "excepthook", threading.excepthook)  # which `open_run` sets
             warnings.resetwarnings()  # to those that a process of its own would print
             for hidden in (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning):
                 warnings.simplefilter("ignore", hidden)

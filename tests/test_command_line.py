@@ -1,13 +1,10 @@
 """The scripts as a user runs them: smoke runs as processes, their curves, and refusals of bad input."""
 
 import contextlib
-import inspect
 import json
 import math
-import os
 import re
 import shlex
-import signal
 import subprocess
 import sys
 import time
@@ -21,7 +18,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import acppo_atari
 import bookkeeping
-from bookkeeping import TENSORBOARD_LAYOUT, check, command_line, commit_of, file_name
+from bookkeeping import TENSORBOARD_LAYOUT, Progress, check_args, code_hash, git_commit, repeat_command
 from conftest import (
     PATIENCE,
     ROOT,
@@ -37,14 +34,14 @@ from conftest import (
 
 
 def documented_tags() -> set[str]:
-    """The tags in the README's table of metrics."""
-    rows = re.findall(r"^\| (`\w+/.*?) \|", (ROOT / "README.md").read_text(encoding="utf-8"), re.MULTILINE)
+    """The tags in the table of curves."""
+    rows = re.findall(r"^\| (`\w+/.*?) \|", (ROOT / "docs" / "curves.md").read_text(encoding="utf-8"), re.MULTILINE)
     return {tag for row in rows for tag in re.findall(r"`((?:charts|losses|time|eval)/\w+)`", row)}
 
 
 def check_a_run_of_two_iterations(script, env_id: str, run_dir: Path) -> None:
     """Asserts that it has logged every documented tag with finite values, and described itself."""
-    exp_name = re.escape(file_name(script.__file__))
+    exp_name = re.escape(Path(script.__file__).stem)
     assert re.fullmatch(rf"{re.escape(env_id.replace(':', '-'))}__{exp_name}__1__\d+", run_dir.name)
     logged = scalars(run_dir)
     assert documented_tags() <= logged.keys()  # a script of one's own may log more
@@ -122,7 +119,7 @@ ARGUMENTS = st.fixed_dictionaries(
 @given(ARGUMENTS)
 def test_the_recorded_command_is_parsed_to_the_same_arguments(arguments):
     args = acppo_atari.Args(**arguments)
-    python, script, *words = shlex.split(command_line(args))
+    python, script, *words = shlex.split(repeat_command(args))
     assert (python, script) == ("python", "acppo_atari.py") and tyro.cli(acppo_atari.Args, args=words) == args
 
 
@@ -141,73 +138,44 @@ def test_the_record_of_a_run_is_strict_json(tmp_path, call_main):
     [(["--bf16"], "AVX2", 1), (["--bf16"], "AVX512", 1), (["--bf16"], "AMX", 0), ([], "AVX2", 0)],
 )
 def test_bfloat16_that_would_be_emulated_is_warned_of_once(flags, kind, lines, monkeypatch, call_main):
-    monkeypatch.setattr(bookkeeping, "kind_of_processor", lambda: kind)
+    monkeypatch.setattr(bookkeeping, "processor_kind", lambda: kind)
     size = flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=128, eval_episodes=0, no_cuda="")
     ended = call_main(acppo_atari, *(flag for flag in size if flag), *flags)
     assert ended.status == 0 and ended.err.count("\n") == ended.err.count("has no bfloat16 instructions") == lines
 
 
-def test_a_closed_stream_gives_its_number_to_no_file():
-    """A result would be written into it: as after `<&- >&- 2>&-`, the numbers 0 to 2 are free."""
-    probe = """
-import os, sys
-os.closerange(0, 3)
-sys.stdout = sys.stderr = None
-sys.argv = ["probe"]
-import bookkeeping
-bookkeeping.parse(int, default=0)
-os._exit(os.open("/dev/null", os.O_RDONLY))
-"""
-    assert subprocess.run([sys.executable, "-c", probe], cwd=ROOT, timeout=PATIENCE).returncode > 2
-
-
-@pytest.mark.parametrize(("words", "status"), [(["--help"], 0), (["--gamma", "much"], 2)])
-def test_help_that_nobody_reads_is_no_failure_and_bad_input_always_is_one(words, status, monkeypatch):
-    def print_to_a_full_disk(*given, **options):
-        raise OSError("No space left on device")
-
-    monkeypatch.setattr(tyro, "cli", print_to_a_full_disk)
-    monkeypatch.setattr(sys, "argv", ["ppo_atari.py", *words])
-    kept = os.dup(1)
-    try:
-        with pytest.raises(SystemExit) as ended:
-            bookkeeping.parse(acppo_atari.Args)
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-    assert (ended.value.code or 0) == status
-
-
-def test_a_script_whose_name_is_not_utf8_is_recorded_with_a_mark(monkeypatch):
-    monkeypatch.setattr(inspect, "getfile", lambda args_class: "/there/my\udcff.py")
-    assert command_line(acppo_atari.Args(threads=1)).split()[1].strip("'") == "my\ufffd.py"
-    # In an ASCII locale Python reads all bytes beyond as such halves; UTF-8 among them is what it is
-    assert bookkeeping.in_utf8("r\udcc3\udcbc") == "r\u00fc"
-
-
-@pytest.mark.parametrize(("file", "name"), [("a/my ppo (2).py", "my-ppo--2-"), ("ppo_atari.py", "ppo_atari")])
-def test_a_script_s_runs_are_named_after_its_file(file, name):
-    assert file_name(file) == name
-
-
-def test_the_commit_is_this_checkout_s_and_dirty_for_a_script_that_it_does_not_hold(tmp_path, monkeypatch):
+def test_the_commit_is_never_another_repositorys(tmp_path, monkeypatch):
     monkeypatch.setenv("GIT_DIR", str(tmp_path))  # of another repository, as in a git hook
-    commit = commit_of(acppo_atari.__file__)
-    assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?", commit) or commit.startswith("unknown (")
-    if not commit.startswith("unknown ("):
+    commit = git_commit(acppo_atari.__file__)
+    assert re.fullmatch(r"[0-9a-f]{40}(-dirty)?", commit) or commit == "unknown"
+    if commit != "unknown":
         (tmp_path / "my_ppo.py").write_text("")
-        assert commit_of(str(tmp_path / "my_ppo.py")) == commit.removesuffix("-dirty") + "-dirty"
+        assert git_commit(str(tmp_path / "my_ppo.py")) == commit.removesuffix("-dirty") + "-dirty"
     another = tmp_path / "another"
     outside = {name: value for name, value in environment().items() if not name.startswith("GIT_")}
     subprocess.run(["git", "init", "-q", another], env=outside, check=True)
-    assert commit_of(acppo_atari.__file__, str(another)).startswith("unknown (")  # it has no commit
+    assert git_commit(acppo_atari.__file__, str(another)) == "unknown"  # it has no commit
     commit_it = ["-c", "user.name=a", "-c", "user.email=b", "commit", "-q", "--allow-empty", "-m", "one"]
     subprocess.run(["git", "-C", another, *commit_it], env=outside, check=True)
-    assert re.fullmatch(r"[0-9a-f]{40}-dirty", commit_of(acppo_atari.__file__, str(another)))
+    assert re.fullmatch(r"[0-9a-f]{40}-dirty", git_commit(acppo_atari.__file__, str(another)))
     monkeypatch.setattr(bookkeeping, "__file__", str(another / "bookkeeping.py"))  # a copy that it does not hold
-    assert "does not hold it" in commit_of(acppo_atari.__file__)
+    assert git_commit(acppo_atari.__file__) == "unknown"
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert commit_of(acppo_atari.__file__).startswith("unknown (")  # git is not installed
+    assert git_commit(acppo_atari.__file__).startswith("unknown (git is not")
+
+
+def test_a_scripts_hash_is_of_what_it_does(tmp_path):
+    script = tmp_path / "script.py"
+    texts = ['"""Doc."""\nx = 1  # why\n', '"""Another."""\n\n# because\nx = 1\n', '"""Doc."""\nx = 2  # why\n']
+    hashes = [script.write_text(text) and code_hash(script) for text in texts]
+    assert hashes[0] == hashes[1] != hashes[2]
+
+
+@given(st.integers(0, 10**12), st.integers(0, 10**12), st.integers(1, 10**6), st.none() | st.integers(-(10**9), 10**9))
+def test_progress_is_read_back_from_its_status_line(step, last_step, speed, score):
+    progress = Progress(min(step, last_step), last_step, float(speed), score if score is None else score / 10)
+    assert Progress.find(f"started\n{Progress(0, 1, 1.0, None)}\n{progress}\n") == progress
+    assert Progress.find("nothing of the kind") is None
 
 
 def test_help_explains_every_flag(script, monkeypatch, call_main):
@@ -223,15 +191,10 @@ def test_help_explains_every_flag(script, monkeypatch, call_main):
 REFUSED = [
     # (flags, the flag that is named, the advice)
     (["--env-id", "Brekout"], "--env-id Brekout", "did you mean Breakout"),
-    (["--env-id", "Brek\nout"], "--env-id Brek out", "unknown environment"),
+    (["--env-id", "Brek\nout"], "--env-id Brek out", "Malformed environment ID"),
     (["--env-id", "Pendulum-v1"], "--env-id Pendulum-v1", "only Discrete actions"),
-    (["--gamma", "1.01"], "--gamma 1.01", "from 0 to 1"),
+    (["--gamma", "1.01"], "--gamma 1.01", "give a value in 0..1"),
     (["--log-dir", "taken"], "--log-dir taken", "cannot be written"),
-    (
-        ["--log-dir", "r\udcff"],
-        "--log-dir r\ufffd",
-        "give it in UTF-8",
-    ),  # as Python decodes a byte
 ]
 
 
@@ -253,26 +216,16 @@ def test_what_cannot_be_parsed_is_refused_too(script, tmp_path, call_main):
 NAN, INF = math.nan, math.inf
 BOUNDS = [
     # (arguments, refused values, the advice, accepted values)
-    (
-        "total_timesteps num_envs num_steps num_minibatches update_epochs",
-        [0, -1, 10**12 + 1],
-        "a whole number from 1 to 10^12",
-        [],
-    ),
-    (
-        "clip_coef vf_clip_coef learning_rate max_grad_norm",
-        [0.0, -0.1, NAN, INF, 1e39],
-        "a number above 0 and below 1e30",
-        [1e-9, 1e29],
-    ),
-    ("ent_coef vf_coef", [-0.1, NAN, INF, 1e39], "a number from 0 to below 1e30", [0.0, 1e29]),
-    ("c checkpoint_minutes", [-0.1, NAN, -INF, 1e39], "a number from 0 to below 1e30, or inf", [0.0, INF]),
-    ("gamma gae_lambda", [-0.1, 1.01, NAN], "a number from 0 to 1", [0.0, 1.0]),
-    ("target_kl", [0.0, -0.1, NAN], "a number above 0", [1e-9, None]),
-    ("stop_at", [0, -1], "a whole number from 1", [1, None]),
-    ("seed eval_episodes", [-1, 2**64], "a whole number from 0 to 2^64 - 1", [0, 2**64 - 1]),
-    ("threads", [0, -1, 100_000], "a number from 1 to", [1]),
-    ("exp_name", ["", "a/b", "a b", "a" * 101], "up to 100 letters, digits", ["a", "A-1_b.c"]),
+    ("total_timesteps num_envs num_steps num_minibatches update_epochs", [0, -1, 10**12 + 1], "1..10^12", []),
+    ("clip_coef vf_clip_coef learning_rate max_grad_norm", [0.0, -0.1, NAN, INF, 1e39], "0<x<1e30", [1e-9, 1e29]),
+    ("ent_coef vf_coef", [-0.1, NAN, INF, 1e39], "0<=x<1e30", [0.0, 1e29]),
+    ("c checkpoint_minutes", [-0.1, NAN, -INF, 1e39], "0<=x<1e30|inf", [0.0, INF]),
+    ("gamma gae_lambda", [-0.1, 1.01, NAN], "0..1", [0.0, 1.0]),
+    ("target_kl", [0.0, -0.1, NAN], "0<x<1e30", [1e-9, None]),
+    ("stop_at", [0, -1], "1..10^12", [1, None]),
+    ("seed eval_episodes", [-1, 2**63], "0..2^63-1", [0, 2**63 - 1]),
+    ("threads", [0, -1, 100_000], "1..1024", [1]),
+    ("exp_name", ["", "a/b", "a b", "a" * 101], "[A-Za-z0-9_.-]{1,100}", ["a", "A-1_b.c"]),
 ]
 ALL_BOUNDS = [(name, *bounds) for names, *bounds in BOUNDS for name in names.split()]
 
@@ -281,11 +234,11 @@ ALL_BOUNDS = [(name, *bounds) for names, *bounds in BOUNDS for name in names.spl
 def test_an_argument_outside_its_bounds_is_refused_by_name(name, bad, said, good, capfd):
     for value in bad:
         with pytest.raises(SystemExit) as ended:
-            check(acppo_atari.Args(**{name: value}))
+            check_args(acppo_atari.Args(**{name: value}))
         line = capfd.readouterr().err
         assert ended.value.code == 2 and line.startswith(f"--{name.replace('_', '-')} {value}: ") and said in line
     for value in good:
-        check(acppo_atari.Args(**{name: value}))
+        check_args(acppo_atari.Args(**{name: value}))
 
 
 SIZES = {"num_envs": 8, "num_steps": 128, "num_minibatches": 4, "norm_adv": True}  # a rollout of 1024 samples
@@ -304,45 +257,28 @@ SIZES = {"num_envs": 8, "num_steps": 128, "num_minibatches": 4, "norm_adv": True
 )
 def test_arguments_that_do_not_go_together_are_refused(script, arguments, said, capfd):
     with pytest.raises(SystemExit) as ended:
-        check(script.Args(**SIZES | arguments))
+        check_args(script.Args(**SIZES | arguments))
     assert ended.value.code == 2 and said in capfd.readouterr().err
 
 
 def test_arguments_at_the_edge_of_going_together_are_taken(script):
-    check(script.Args(**SIZES | {"total_timesteps": 1024}))
-    check(script.Args(**SIZES | {"num_minibatches": 512}))
-    check(script.Args(**SIZES | {"num_minibatches": 1024, "norm_adv": False}))
+    check_args(script.Args(**SIZES | {"total_timesteps": 1024}))
+    check_args(script.Args(**SIZES | {"num_minibatches": 512}))
+    check_args(script.Args(**SIZES | {"num_minibatches": 1024, "norm_adv": False}))
 
 
-def test_importing_a_script_leaves_the_environment_alone():
-    probe = "import os; before = dict(os.environ); import ppo_atari, acppo_atari; assert os.environ == before"
-    subprocess.run([sys.executable, "-c", probe], cwd=ROOT, check=True, timeout=PATIENCE)
-
-
-def test_ctrl_c_during_the_imports_ends_without_a_traceback(script, tmp_path):
-    """In the place of a package that is imported early stands a file that interrupts its own process."""
-    (tmp_path / "filelock.py").write_text(
-        "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(60)"
-    )
-    restore = {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.default_int_handler)}  # if ignored out here
-    command = [sys.executable, script.__file__]
-    interrupted = environment(tmp_path)
-    ended = subprocess.run(command, env=interrupted, capture_output=True, text=True, timeout=PATIENCE, **restore)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (128 + signal.SIGINT, "", "")
-
-
-def test_nothing_that_only_posix_has_is_needed_to_import_and_train(tmp_path):
-    """What another system lacks is taken away: modules, signals, and functions of `os`."""
+def test_importing_a_script_changes_nothing_in_its_importer():
+    """Neither variables nor the treatment of denormal numbers, which a script that trains flushes to 0."""
     probe = """
-import os, signal, sys
-sys.modules |= dict.fromkeys(("fcntl", "resource", "pwd", "grp", "termios"))
-for module, names in ((os, "sched_getaffinity getuid fchmod"), (signal, "SIGHUP")):
-    for name in names.split():
-        delattr(module, name)
-sys.argv[1:] = "--env-id CartPole-v1 --num-steps 8 --total-timesteps 64 --threads 1 --eval-episodes 0".split()
-import acppo_atari
-acppo_atari.main()
+import os
+before = dict(os.environ)
+import ppo_atari, acppo_atari, torch
+assert os.environ == before
+def denormals():
+    return (torch.full((1 << 20,), 2.0**-126) * 0.5).count_nonzero().item()  # on all threads
+assert denormals() == 1 << 20
 """
-    command = [sys.executable, "-c", probe]
-    ended = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=PATIENCE)
-    assert ended.returncode == 0, ended.stderr
+    training = "import bookkeeping; bookkeeping.tune_process(); import torch; torch.set_num_threads(2)\n"
+    training += probe[probe.index("def") : probe.index("assert denormals")] + "assert denormals() == 0"
+    for text in (probe, training):
+        subprocess.run([sys.executable, "-c", text], cwd=ROOT, check=True, timeout=PATIENCE)

@@ -32,7 +32,7 @@ def spo(tmp_path_factory):
     return load(spo_in(tmp_path_factory.mktemp("spo")))
 
 
-def test_the_patch_is_small_and_changes_the_arguments_and_the_surrogate_alone(spo):
+def test_the_patch_is_small_and_changes_the_surrogate(spo):
     hunks = changes(lines_of(PPO), lines_of(spo.__file__))
     assert 0 < sum(i2 - i1 for i1, i2, _, _ in hunks) <= 15
     assert 0 < sum(j2 - j1 for _, _, j1, j2 in hunks) <= 30
@@ -41,7 +41,7 @@ def test_the_patch_is_small_and_changes_the_arguments_and_the_surrogate_alone(sp
 
 
 @pytest.mark.parametrize("advantage", [-3.0, -0.5, 0.5, 3.0])
-def test_spos_objective_is_concave_with_its_maximum_where_the_ratio_has_moved_by_epsilon(spo, advantage):
+def test_spos_objective_is_concave_with_its_maximum_at_epsilon(spo, advantage):
     ratio = torch.linspace(0.01, 2, 200, dtype=torch.float64, requires_grad=True)  # steps of 0.01
     advantages = torch.full_like(ratio, advantage)
     objective = spo.surrogate(ratio, advantages, spo.clip_range(advantages, EPSILON))

@@ -110,6 +110,20 @@ def test_bfloat16_is_for_the_trunk_alone(script, monkeypatch):
 
 
 @pytest.mark.thesis("Agent")
+def test_a_snapshot_acts_bit_for_bit_as_the_agent_it_is_of(script):
+    """Under bfloat16 it is a copy whose trunk is cast once; without, there is nothing to cast."""
+    agent = script.Agent((4, 84, 84), 6, bf16=True).to(memory_format=torch.channels_last)
+    snapshot = agent.snapshot()
+    obs = torch.randint(0, 256, (8, 84, 84, 4), dtype=torch.uint8)
+    with torch.inference_mode():
+        assert all(map(torch.equal, agent(obs), snapshot(obs)))
+    assert {parameter.dtype for parameter in snapshot.network.parameters()} == {torch.bfloat16}
+    assert {parameter.dtype for parameter in agent.parameters()} == {torch.float32}
+    exact = script.Agent((4, 84, 84), 6)
+    assert exact.snapshot() is exact
+
+
+@pytest.mark.thesis("Agent")
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float32])
 def test_the_trunk_gets_each_brightness_rounded_once(script, dtype):
     """As if it were divided by 255 in float32 first, and then cast: the same bits for all 256 values."""

@@ -113,7 +113,7 @@ def value_and_gradient(objective, ratio):
     return objective.detach(), torch.autograd.grad(objective.sum(), ratio)[0]
 
 
-def test_at_c_infinite_the_objective_is_the_product_only_one_of_the_thesis():
+def test_the_objective_at_c_infinite_is_the_product_only_one():
     """L^× of section 3.1 plus Â, which has mean 0 and no gradient: value and gradient, sample by sample."""
     ratio, advantages = samples()
     delta = 0.15
@@ -127,7 +127,7 @@ def test_at_c_infinite_the_objective_is_the_product_only_one_of_the_thesis():
     assert torch.allclose(gradient, expected_gradient, atol=1e-12)
 
 
-def test_a_large_c_with_epsilon_c_delta_approaches_the_product_only_objective():
+def test_a_large_c_approaches_the_product_only_objective():
     ratio, advantages = samples()
     delta, c = 0.15, 1e6
     at_infinity = acppo_atari.surrogate(ratio, advantages, acppo_atari.clip_range(advantages, delta, math.inf))
@@ -153,13 +153,13 @@ def gradients_of_the_surrogate(script):
     return torch.autograd.grad(objective.sum(), flat_ratio)[0].reshape(ratio.shape), ratio, advantages
 
 
-def test_of_a_policy_that_has_not_moved_the_surrogates_gradient_is_the_policy_gradient(each_script):
+def test_a_policy_that_has_not_moved_gets_the_policy_gradient(each_script):
     """At ρ = 1 it is Â, for PPO and all its kin: they differ in how they brake from there on."""
     gradient, ratio, advantages = gradients_of_the_surrogate(each_script)
     assert (ratio[49] == 1).all() and torch.allclose(gradient[49], advantages[49], atol=1e-12)
 
 
-def test_a_ratio_that_has_moved_as_the_advantage_wants_is_pushed_on_no_harder_than_at_one(each_script):
+def test_a_ratio_that_has_moved_is_pushed_on_no_harder_than_at_one(each_script):
     gradient, ratio, advantages = gradients_of_the_surrogate(each_script)
     moved = (ratio - 1) * advantages > 0
     assert moved.sum() == 4 * (100 + 49)
@@ -167,7 +167,7 @@ def test_a_ratio_that_has_moved_as_the_advantage_wants_is_pushed_on_no_harder_th
 
 
 @pytest.mark.thesis("surrogate")
-def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(each_script):
+def test_the_surrogate_removes_gains_outside_the_range_not_losses(each_script):
     ratio = torch.tensor([1.5, 0.5, 1.5, 0.5, 1.05])
     advantages = torch.tensor([2.0, 2.0, -2.0, -2.0, 2.0])
     clip = torch.full((5,), 0.1)
@@ -176,7 +176,7 @@ def test_the_surrogate_removes_the_gain_outside_the_range_and_keeps_the_loss(eac
 
 
 @pytest.mark.thesis("value_loss")
-def test_the_value_loss_is_half_the_squared_error_and_the_larger_of_two_when_clipped(each_script):
+def test_the_value_loss_is_the_larger_of_plain_and_clipped(each_script):
     new_values, values, returns = torch.tensor([1.0, 1.0]), torch.tensor([0.0, 0.0]), torch.tensor([3.0, 0.0])
     assert each_script.value_loss(new_values, values, returns, None).item() == pytest.approx(0.5 * (4 + 1) / 2)
     # Clipped to 0.1: errors 2.9² and 0.1², of which the larger with 2² and 1² counts

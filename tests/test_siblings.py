@@ -17,7 +17,7 @@ ACPPO = ROOT / "acppo_atari.py"
 
 PLACES = {  # places that a hunk may touch: lines from the one to the other, the second not included
     "docstring": ('"""', "Sections: "),
-    "Args": ("class Args:", "@property"),
+    "Args": ("class Args(", "@property"),
     "clip_range": ("def clip_range(", "def surrogate("),
     "the line that calls it": ("clip = clip_range(", "pg_loss = "),
 }
@@ -97,6 +97,6 @@ def test_a_script_from_anywhere_can_import_the_files_beside_it(tmp_path, monkeyp
     assert (script.__name__, script.EPSILON, script.Args().exp_name) == ("my idea", 0.3, "my-idea")
 
 
-def test_what_a_script_does_in_its_own_way_is_known_by_the_text_of_its_functions():
+def test_changed_definitions_are_known_by_their_text():
     assert changed_definitions(ACPPO) == {"Args", "clip_range", "train"}
     assert changed_definitions(PPO) == set()

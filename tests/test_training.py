@@ -50,7 +50,7 @@ def test_with_learning_rate_zero_the_policy_does_not_move(script, tmp_path):
     assert np.abs(values(logged, "losses/clipfrac")).max() == 0
 
 
-def test_the_average_clip_ratio_lies_between_its_bounds_at_every_iteration(tmp_path):
+def test_the_average_clip_ratio_lies_between_its_bounds(tmp_path):
     epsilon, c = 0.16, 1.0
     logged = train(acppo_atari, tmp_path, clip_coef=epsilon, c=c, **{**CARTPOLE, "total_timesteps": 1280})
     averages = values(logged, "losses/avg_clip_ratio")
@@ -100,7 +100,7 @@ def test_environments_with_all_kinds_of_numbers_move_the_policy(script, env_id, 
     assert len(kl) == 2 and (kl > 0).all()
 
 
-def test_the_learning_rate_falls_linearly_and_steps_count_all_environments(script, tmp_path):
+def test_the_learning_rate_falls_linearly_over_all_steps(script, tmp_path):
     logged = train(script, tmp_path, learning_rate=0.01, **{**CARTPOLE, "total_timesteps": 640})
     steps, rates = zip(*logged["charts/learning_rate"])
     assert steps == (128, 256, 384, 512, 640)
@@ -241,7 +241,8 @@ def test_the_value_loss_is_clipped_unless_it_is_switched_off(script, clip_vloss,
     assert {given[3] for given, _ in fit.calls} == {expected}
 
 
-def test_the_gradients_norm_is_clipped(script, tmp_path):
+def test_the_gradients_norm_is_clipped_and_logged_as_it_was(script, tmp_path):
+    """At learning rate 0 a training with a norm that nothing exceeds has the same gradients."""
     norms = []
 
     def keep_norm(optimizer, *_):
@@ -249,9 +250,22 @@ def test_the_gradients_norm_is_clipped(script, tmp_path):
         norms.append(torch.cat(gradients).norm().item())
 
     hook = register_optimizer_step_pre_hook(keep_norm)
-    train(script, tmp_path, max_grad_norm=0.02, **CARTPOLE)
+    arguments = {**CARTPOLE, "learning_rate": 0.0}
+    train(script, tmp_path / "free", max_grad_norm=1e9, **arguments)
+    logged = train(script, tmp_path / "clipped", max_grad_norm=0.02, **arguments)
     hook.remove()
-    assert len(norms) == 32 and norms == pytest.approx([0.02] * 32, rel=1e-3)
+    free, clipped = np.split(np.array(norms), 2)
+    assert clipped == pytest.approx([0.02] * 32, rel=1e-3)
+    assert values(logged, "losses/grad_norm") == pytest.approx(free.reshape(2, 16).mean(1), rel=1e-4)
+
+
+@pytest.mark.thesis("Agent")
+def test_every_rollout_under_bfloat16_is_of_the_latest_policy(script, tmp_path, monkeypatch):
+    """A ratio is 1 in an iteration's first minibatch, but for the rounding of other sizes of a batch."""
+    objective = Recorder(monkeypatch, script, "surrogate")
+    train(script, tmp_path, bf16=True, learning_rate=0.01, env_id=TINY_PIXELS, **SCREENS)
+    first, last = objective.calls[16][0][0], objective.calls[15][0][0]
+    assert (first - 1).abs().max() < 0.05 < (last - 1).abs().max()
 
 
 def test_rewards_and_scores_are_those_of_the_environments(script, tmp_path, monkeypatch):

@@ -66,11 +66,8 @@ def make_envs(
         truncated, `info["final_obs"]` holds the observation that it ended on (other rows are not to be read).
 
     Raises:
-        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported, or
-            `num_envs` is not a whole number above 0.
+        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
     """
-    if not isinstance(num_envs, int | np.integer) or num_envs < 1:  # ale-py kills the process on 0
-        raise ValueError(f"num_envs is {num_envs!r}; give a whole number above 0")
     if (atari := find_atari_game(env_id)) is None:
         return make_gymnasium_envs(env_id, num_envs, video)
     rom, repeat_action_probability = atari

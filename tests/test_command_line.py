@@ -261,12 +261,6 @@ def test_arguments_that_do_not_go_together_are_refused(script, arguments, said, 
     assert ended.value.code == 2 and said in capfd.readouterr().err
 
 
-def test_arguments_at_the_edge_of_going_together_are_taken(script):
-    check_args(script.Args(**SIZES | {"total_timesteps": 1024}))
-    check_args(script.Args(**SIZES | {"num_minibatches": 512}))
-    check_args(script.Args(**SIZES | {"num_minibatches": 1024, "norm_adv": False}))
-
-
 def test_importing_a_script_changes_nothing_in_its_importer():
     """Neither variables nor the treatment of denormal numbers, which a script that trains flushes to 0."""
     probe = """

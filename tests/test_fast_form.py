@@ -134,18 +134,3 @@ def test_the_trunk_gets_each_brightness_rounded_once(script, dtype):
     expected = (screen.movedim(-1, 1).to(torch.float32) / 255).to(dtype)
     assert entered[0].dtype == dtype and len(expected.unique()) > 200
     assert torch.equal(entered[0], expected.expand(1, 4, 84, 84))
-
-
-@pytest.mark.thesis("Agent")
-def test_bfloat16_moves_a_policy_less_than_an_update_does(script):
-    """The noise floor of the KL under bfloat16: the same network, its logits well apart, in both precisions."""
-    torch.manual_seed(1)
-    agent = script.Agent((4, 84, 84), 6)
-    agent.actor.weight.data.mul_(100)
-    obs = torch.randint(0, 256, (32, 84, 84, 4), dtype=torch.uint8)
-    exact = agent(obs)[0].log_softmax(-1)
-    agent.bf16 = True
-    rounded = agent(obs)[0].log_softmax(-1)
-    kl = (exact.exp() * (exact - rounded)).sum(1).mean().item()
-    assert exact.std() > 0.2
-    assert 1e-9 < kl < 1e-4

@@ -1,6 +1,5 @@
 """A run is never lost: checkpoints, resuming, signals, and faults that are provoked for real."""
 
-import json
 import math
 import os
 import random
@@ -10,13 +9,10 @@ import shutil
 import signal
 import sys
 import time
-from collections import Counter
 from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from tbparse import SummaryReader
 from torch.utils.tensorboard import SummaryWriter
 
@@ -225,13 +221,12 @@ def test_a_directory_that_is_not_there_is_refused(script, call_main):
 def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
     """A byte of padding between the parts of the file may change; nothing that is read from it may."""
     path, offsets = finished / "checkpoint.pt", random.Random(3)
-    whole, original = path.read_bytes(), checkpoint_of(finished)
-    refused = 0
+    whole, original, refused = path.read_bytes(), checkpoint_of(finished), 0
     with open_run(script, finished) as run:
         for attempt in range(200):
             damaged = bytearray(whole)
             if attempt % 4 == 0:
-                damaged = damaged[: offsets.randrange(len(whole))]
+                del damaged[offsets.randrange(len(whole)) :]
             else:
                 damaged[offsets.randrange(len(whole))] ^= 1 << offsets.randrange(8)
             path.write_bytes(damaged)
@@ -240,11 +235,9 @@ def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
             except ValueError as error:
                 refused += "damaged" in str(error)
             else:
-                assert attempt % 4 != 0
-                assert state["args"] == original["args"] and state["global_step"] == original["global_step"]
-                assert all(torch.equal(value, original["agent"][name]) for name, value in state["agent"].items())
-                for index, moments in original["optimizer"].items():
-                    assert all(torch.equal(value, state["optimizer"][index][name]) for name, value in moments.items())
+                assert attempt % 4 != 0 and state["args"] == original["args"]
+                for part in ("agent", "optimizer", "rng", "last_scores", "global_step"):
+                    torch.testing.assert_close(state[part], original[part], rtol=0, atol=0)
     assert refused > 100
 
 
@@ -403,86 +396,6 @@ def test_an_event_file_that_cannot_be_written_has_a_successor(script, tmp_path, 
     logged = train(script, tmp_path, **CARTPOLE, total_timesteps=4 * ITERATION)
     assert [step for step, _ in logged["losses/kl"]][-2:] == [3 * ITERATION, 4 * ITERATION]
     assert len(list(tmp_path.glob("events.*"))) == 2
-
-
-def test_the_last_checkpoint_is_enough_to_play(script, finished):
-    state = checkpoint_of(finished)
-    envs = make_envs(state["args"]["env_id"], 1)
-    agent = script.Agent(envs.single_observation_space.shape, int(envs.single_action_space.n))
-    agent.load_state_dict(state["agent"])
-    obs, _ = envs.reset(seed=[1])
-    for _ in range(10):
-        actions, _, _ = script.act(agent, torch.from_numpy(obs).movedim(1, -1))
-        obs, *_ = envs.step(actions.numpy())
-
-
-numbers = st.one_of(
-    st.sampled_from(
-        [-1, 0, 1, 2, 3, 4, 32, 128, 1024, 0.1, 0.5, 1e-3, 1e30, "nan", "inf", "-inf", "1e3", "x", "", "None"]
-    ),
-    st.integers(-3, 40),
-    st.floats(-1, 2, allow_nan=False).map(lambda value: f"{value:.3f}"),
-)
-sizes = st.one_of(st.integers(-1, 9), st.sampled_from([16, 32, 64, "4.5", "x"]))
-names = st.sampled_from(
-    ["CartPole-v1", "Acrobot-v1", TINY_PIXELS, "Brekout", "Pendulum-v1", "a:b:c", "", "\n", "ALE/", "-"]
-)
-NUMBERS = "learning_rate gamma gae_lambda clip_coef vf_clip_coef ent_coef vf_coef max_grad_norm target_kl seed".split()
-ODD = {  # odd values for any flag
-    **dict.fromkeys(("num_envs", "num_steps", "num_minibatches", "update_epochs"), sizes),
-    **dict.fromkeys((*NUMBERS, "checkpoint_minutes", "stop_at"), numbers),
-    "total_timesteps": st.integers(-1, 700),
-    "env_id": names,
-    "exp_name": st.sampled_from(["a", "a/b", "..", "", "ä", "x" * 300]),
-    "log_dir": st.sampled_from(["runs", "a/b", "taken", "taken/b", "/proc/none", ""]),
-    "resume": st.sampled_from(["nowhere", "taken", "", "."]),
-    "evaluate": st.sampled_from(["nowhere", "taken", "", "."]),
-    "eval_episodes": st.sampled_from([-1, 0, 1, 3, 10**20, "x"]),
-    "threads": st.integers(-1, 2),
-}
-SENSIBLE = {
-    "num_envs": st.integers(1, 4),
-    "num_steps": st.sampled_from([4, 8, 16]),
-    "num_minibatches": st.sampled_from([1, 2, 4]),
-    "total_timesteps": st.integers(64, 200),
-    "gamma": st.floats(0, 1),
-    "learning_rate": st.floats(1e-9, 1e3),
-    "env_id": st.sampled_from(["CartPole-v1", "Acrobot-v1", TINY_PIXELS]),
-}
-# Sensible ones, of which up to three flags are given something odd
-COMMAND_LINES = st.tuples(
-    st.fixed_dictionaries(SENSIBLE),
-    st.lists(st.one_of(*(st.tuples(st.just(name), values) for name, values in ODD.items())), max_size=3).map(dict),
-).map(lambda drawn: drawn[0] | drawn[1])
-
-
-@pytest.mark.slow
-def test_every_command_line_trains_or_is_refused_in_one_line(script, tmp_path, monkeypatch, call_main):
-    """300 command lines, sensible and not, through `main` in this process; none may end in a traceback."""
-    outcomes = Counter()
-
-    @settings(max_examples=300, deadline=None, database=None, suppress_health_check=list(HealthCheck))
-    @given(COMMAND_LINES, st.integers(0, 2**63))
-    def check(arguments, number):
-        directory = tmp_path / str(number)
-        directory.mkdir(exist_ok=True)
-        (directory / "taken").write_text("a file")
-        monkeypatch.chdir(directory)
-        arguments = {"threads": 1, "eval_episodes": 0, **arguments}
-        status, out, err = call_main(script, *(f"--{k.replace('_', '-')}={v}" for k, v in arguments.items()))
-        assert "Traceback" not in out + err
-        if status == 2:
-            assert err.count("\n") == 1 or "╭" in err
-            assert [path.name for path in directory.iterdir()] == ["taken"]
-        else:
-            assert status == 0 or (status == 1 and "not finite" in err)
-        outcomes[status] += 1
-        monkeypatch.chdir(tmp_path)
-        shutil.rmtree(directory)
-
-    check()
-    print(json.dumps({"trained": outcomes[0], "refused": outcomes[2], "not finite": outcomes[1]}))
-    assert outcomes[0] > 60 and outcomes[2] > 60
 
 
 def test_a_checkpoint_that_breaks_off_leaves_the_one_before_it(script, tmp_path, monkeypatch, capfd):

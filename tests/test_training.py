@@ -71,28 +71,6 @@ def test_the_readmes_flags_for_vectors_solve_cartpole(script, tmp_path):
     assert values(logged, "charts/mean_return_100")[-1] >= 450  # of 500
 
 
-@pytest.mark.thesis
-@pytest.mark.slow
-def test_the_shortest_way_along_a_cliff_is_found(script, tmp_path):
-    """13 steps, each beside the cliff. Without entropy no seed finds the goal, with it one in five settles on 15."""
-    flags = {"learning_rate": 2.5e-3, "num_steps": 32, "ent_coef": 0.15, "vf_coef": 0.01, "clip_vloss": False}
-
-    def last_scores(seed: int) -> np.ndarray:
-        arguments = {"env_id": "CliffWalking-v1", "total_timesteps": 150_000, "clip_coef": 0.2, "seed": seed}
-        return values(train(script, tmp_path / str(seed), **arguments, **flags), "charts/episodic_return")[-100:]
-
-    assert any(np.median(last_scores(seed)) == -13 for seed in (1, 2, 3))
-
-
-@pytest.mark.thesis
-@pytest.mark.slow
-def test_minatars_breakout_is_learnt(script, tmp_path):
-    pytest.importorskip("minatar")
-    flags = {"learning_rate": 2.5e-3, "num_steps": 32, "clip_vloss": False}
-    logged = train(script, tmp_path, env_id="minatar:MinAtar/Breakout-v1", total_timesteps=300_000, **flags)
-    assert values(logged, "charts/mean_return_100")[-1] > 5
-
-
 @pytest.mark.parametrize("env_id", ["FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1", "Acrobot-v1"])
 def test_environments_with_all_kinds_of_numbers_move_the_policy(script, env_id, tmp_path):
     logged = train(script, tmp_path, env_id=env_id, num_envs=2, num_steps=16, total_timesteps=64)

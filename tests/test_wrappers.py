@@ -1,6 +1,5 @@
 """The environments: real games step by step against a reference, names, seeds, and what is refused."""
 
-import importlib.metadata
 import itertools
 import math
 import sys
@@ -204,13 +203,6 @@ def test_other_images_become_stacked_grey_screens(env_id):
     assert np.array_equal(moved[:, :3], obs[:, 1:])  # the oldest screen leaves, the others move up
 
 
-@pytest.mark.parametrize("num_envs", [0, -1, 1.5])
-@pytest.mark.parametrize("env_id", ["Pong", "CartPole-v1"])
-def test_there_is_a_whole_number_of_environments(env_id, num_envs):
-    with pytest.raises(ValueError, match=f"num_envs is {num_envs}"):
-        make_envs(env_id, num_envs)
-
-
 @pytest.mark.parametrize("name", NUMBERS)
 def test_all_numbers_but_screens_become_one_float32_vector(name, monkeypatch):
     """Gymnasium's own function says which."""
@@ -224,14 +216,6 @@ def test_all_numbers_but_screens_become_one_float32_vector(name, monkeypatch):
     assert obs.dtype == np.float32 and np.array_equal(obs[0], flatten(space, shown[-1]).astype(np.float32))
 
 
-def test_a_cell_is_one_hot():
-    envs = make_envs("FrozenLake-v1", 1)
-    obs, _ = envs.reset(seed=[1])
-    for action in (2, 1, 2):
-        assert obs.tolist() == [[float(cell == envs.unwrapped.envs[0].unwrapped.s) for cell in range(16)]]
-        obs, *_ = envs.step(np.array([action]))
-
-
 def test_a_module_may_lie_in_the_current_directory(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.chdir(tmp_path)
@@ -243,19 +227,6 @@ def test_a_module_may_lie_in_the_current_directory(tmp_path, monkeypatch):
         (tmp_path / f"broken{len(text)}.py").write_text(text)
         with pytest.raises(ValueError, match=f"it cannot be built: {said}"):
             make_envs(f"broken{len(text)}:Env-v0", 1)
-
-
-@pytest.mark.parametrize("env_id", ["Plugged/Env-v0", "tiny_envs:PluggedAsWell-v0"])
-def test_a_package_registers_in_the_call_that_it_declares(env_id, monkeypatch):
-    """MinAtar's does. It is known by the id's namespace or by its module."""
-    called = importlib.metadata.EntryPoint("Plugged", "tiny_envs:register_plugged", "gymnasium.envs")
-    others = importlib.metadata.EntryPoint("Other", "no_such_module:register", "gymnasium.envs")
-    monkeypatch.setattr(importlib.metadata, "entry_points", lambda group: [others, called])
-    try:
-        assert make_envs(env_id, 1).single_observation_space.shape == (1,)
-    finally:
-        for registered in ("Plugged/Env-v0", "PluggedAsWell-v0"):
-            gym.registry.pop(registered, None)
 
 
 def test_flat_observations_become_float32_and_rewards_stay():

@@ -125,10 +125,8 @@ NUMBERS = {
     "Number": Box(0, 1, ()),
     "Switches": MultiBinary((2, 3)),
     "Counts": MultiDiscrete([2, 3]),
-    "Booleans": Box(0, 1, (4, 4, 2), bool),
     "Grid": Box(0, 10, (7, 7, 3), np.uint8),
     "Wide": Box(0, 255, (35, 84), np.uint8),
-    "Narrow": Box(0, 255, (84, 35, 3), np.uint8),
     "FourChannels": Box(0, 255, (84, 84, 4), np.uint8),
     "Nested": Dict(place=Tuple([Discrete(4), Box(-1, 1, (2, 2), np.float64)]), image=Box(0, 255, (40, 40), np.uint8)),
 }
@@ -151,11 +149,6 @@ class CannotStart(gym.Env):
 
     def reset(self, *, seed=None, options=None):
         raise FileNotFoundError("level.txt")
-
-
-def register_plugged() -> None:
-    gym.register("Plugged/Env-v0", RewardNothing)
-    gym.register("PluggedAsWell-v0", RewardNothing)
 
 
 gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})

@@ -86,7 +86,7 @@ def test_a_script_from_anywhere_can_import_the_files_beside_it(tmp_path, monkeyp
     own = "from idea_beside_it import EPSILON\n\n\ndef clip_range("
     (tmp_path / "my idea.py").write_text(PPO.read_text(encoding="utf-8").replace("def clip_range(", own))
     script = load(tmp_path / "my idea.py")
-    assert (script.__name__, script.EPSILON, script.Args().exp_name) == ("my idea", 0.3, "my-idea")
+    assert (script.__name__, script.EPSILON, script.Args().exp_name) == ("my idea", 0.3, "my idea")
 
 
 def test_changed_definitions_are_known_by_their_text():

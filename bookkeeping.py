@@ -305,6 +305,8 @@ class RunDirectory:
             with zipfile.ZipFile(self.checkpoint) as archive:
                 whole = archive.testzip() is None  # torch.load itself takes flipped bytes for parameters
             state = torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+            state["args"].pop("compile", None)  # the finished runs of commit 3a0949c have it, and another name for:
+            state["num_starts"] = state.pop("starts", state.get("num_starts"))
             others = state["args"].keys() ^ (args_class.__dataclass_fields__.keys() - PER_CALL_ARGS)
             whole &= all(tensor.isfinite().all().item() for tensor in state["agent"].values())
         except Exception as error:  # a file that is no checkpoint can make them raise anything
@@ -571,9 +573,6 @@ def play(
 
 def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal | None = None) -> None:
     """Plays `args.eval_episodes` games with the policy of agent step `step`, and prints and logs their scores."""
-    import torch
-
-    torch.set_num_threads(args.threads)
     envs = make_envs(args.env_id, args.num_envs, args.threads)  # however many games: so each has its number
     games = play(policy, envs, args.eval_episodes, [args.seed, 1], stop)
     envs.close()
@@ -638,6 +637,7 @@ def open_run(args_class: type, description: str):
                 message = f"the run has {state['args'][fixed]}, which cannot change"
                 usage_error(as_flag(fixed, getattr(args, fixed)), message)
     check_args(args)
+    torch.set_num_threads(args.threads)
     if args.resume is not None and state["iteration"] >= args.last_iteration:
         limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
         print(f"{run.path} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")

@@ -1,112 +1,103 @@
-"""Event files → OUT/runs.csv, a row a run, and OUT/curves.csv, a row an iteration.
+"""Training directories → run directories, the form in which a run is kept in git.
 
-    python benchmark/collect.py
-    python benchmark/collect.py --out ../another-grid
+    python benchmark/collect.py                                     # all of results/training
+    python benchmark/collect.py runs/Qbert__mine__1__1700000000 --note first-try
 
-Every run directory under OUT/runs is read, a thesis-sized one in six seconds. Runs that are in the CSVs already and
-have no directory here keep their rows, so that grids of several machines add up. A run that is found replaces its own
-rows, also those of a run that got further (said on standard error).
+A run directory is OUT/runs/GAME__VARIANT__SEED or, with a note, OUT/runs/GAME__VARIANT__SEED__NOTE. Its `run.json` has
+arguments, commit, versions, machine, hours and the last evaluation; its `curve.csv.gz` has a row an iteration. The note
+tells two runs of one game, variant and seed apart, and `report.py` compares the runs that have the same note.
+
+A new run adds files and changes none. A training directory that is collected again, because it got further or was
+evaluated, updates the run that it became. One with the thesis's schedule is read in six seconds.
 """
 
-import csv
+import gzip
 import json
 import re
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import tyro
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import parse, refuse, say, tell, write_text
+from bookkeeping import usage_error, write_file
 
 ROOT = Path(__file__).resolve().parent.parent
-DEFAULT_OUT = ROOT / "benchmark" / "results"
+DEFAULT_OUT = ROOT / "results"
 LOSSES = "kl old_approx_kl avg_clip_ratio clipfrac tv_distance max_tv_distance max_ratio_advantage".split()
-LOSSES += ["entropy", "explained_variance"]
-TAGS = {"mean_return_100": "charts/mean_return_100", **{name: f"losses/{name}" for name in LOSSES}}
-TAGS["learning_rate"] = "charts/learning_rate"
-KEY = ["variant", "game", "seed"]
-# The evaluation: of the agent at its last checkpoint, sample standard deviation (ddof 1)
-EVALUATION = ["eval_games", "eval_mean", "eval_std"]
-RUN_COLUMNS = [*KEY, *"steps total_timesteps command arguments commit versions machine threads".split(), *EVALUATION]
-CURVE_COLUMNS = [*KEY, "step", *TAGS, "games_ended"]  # the last: since the start
-PLACE = ("commit", "machine", "threads")  # of a run's provenance, these have a column each; the rest are versions
+LOSSES += ["entropy", "explained_variance", "grad_norm"]
+TAGS = {name: f"charts/{name}" for name in ("mean_return_100", "learning_rate")}
+TAGS |= {name: f"losses/{name}" for name in LOSSES}
+
+# By variant, game and seed: what run.json holds; and the curve, a row an iteration, by agent step (TAGS, games_ended)
+Runs = dict[tuple[str, str, int], dict]
+Curves = dict[tuple[str, str, int], pd.DataFrame]
 
 
 @dataclass
 class Args:
+    training_directories: tyro.conf.Positional[tuple[Path, ...]] = ()
+    """directories as the scripts leave them; without any, all in OUT/training"""
     out: Path = DEFAULT_OUT
-    """directory of the grid: its runs are in OUT/runs, and the CSVs are written beside that"""
+    """directory of the results"""
+    note: str = ""
+    """a word for runs that must stand apart from those without one; a run collected before keeps its note"""
 
 
-def collect(out: Path) -> None:
-    """Brings OUT/runs.csv and OUT/curves.csv up to date with the run directories under OUT/runs."""
-    found: dict[tuple, tuple[str, dict, pd.DataFrame]] = {}
-    directories = sorted(path for path in (out / "runs").iterdir() if path.is_dir()) if (out / "runs").is_dir() else []
-    for directory in directories:
+def collect(out: Path, directories: Sequence[Path] = (), note: str = "") -> list[Path]:
+    """Brings OUT/runs up to date with training directories; returns what it wrote, nothing where another run is."""
+    if not re.fullmatch(r"[\w.-]*", note):
+        usage_error(f"--note {note}", "give letters, digits, '.', '_' and '-'")
+    records = read_records(out)
+    notes = {record["source"]: record["note"] for record in records.values()}
+    found: dict[Path, tuple[dict, pd.DataFrame]] = {}
+    for directory in directories or sorted(path for path in (out / "training").glob("*") if path.is_dir()):
         try:
-            run, curve = read_run(directory)
-        except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:  # it is not as it should be
-            say(f"{directory}: left out ({type(error).__name__}: {error})")
+            record, curve = read_training(directory)
+        except (OSError, ValueError, LookupError, TypeError) as error:  # no run, or one without an iteration yet
+            print(f"{directory}: left out ({type(error).__name__}: {error})", file=sys.stderr)
             continue
-        key = tuple(run[name] for name in KEY)
-        if key in found:
-            other, kept, _ = found[key]
-            names = (other, directory.name) if kept["steps"] > run["steps"] else (directory.name, other)
-            say(f"{' '.join(map(str, key))}: {names[0]} counts, {names[1]} got no further")
-        if key not in found or run["steps"] >= found[key][1]["steps"]:
-            found[key] = (directory.name, run, curve)
-    if not found:
-        return
-    runs, curves = read_csvs(out)
-    for *key, before in runs[[*KEY, "steps"]].itertuples(index=False):
-        if tuple(key) in found and before > (steps := found[tuple(key)][1]["steps"]):
-            say(f"{' '.join(map(str, key))}: {steps} steps replace {before}")
-    new_runs = pd.DataFrame([run for _, run, _ in found.values()], columns=RUN_COLUMNS)
-    new_curves = pd.concat([curve for _, _, curve in found.values()])
-    for name, known, new in (("runs.csv", runs, new_runs), ("curves.csv", curves, new_curves)):
-        kept = known[[key not in found for key in known[KEY].itertuples(index=False, name=None)]]
-        table = pd.concat([kept, new]) if len(kept) else new
-        table = table.sort_values(list(table.columns[:4]))  # the key and the step: a small diff
-        write_text(out / name, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+        record["note"] = notes.get(record["source"], note)
+        words = [str(record[name]) for name in ("game", "variant", "seed", "note") if record[name] != ""]
+        path = out / "runs" / re.sub(r"[^\w.-]", "-", "__".join(words))
+        if path in found or records.get(path, record)["source"] != record["source"]:
+            usage_error(f"{directory}", f"{path} holds another run; give --note NOTE to keep both")
+        found[path] = record, curve
+    for path, (record, curve) in found.items():
+        write_run(path, record, curve)
+    return list(found)
 
 
-def read_run(directory: Path) -> tuple[dict, pd.DataFrame]:
-    """Returns a run's row of runs.csv and its rows of curves.csv."""
-    record = json.loads((directory / "args.json").read_text(encoding="utf-8"))
-    args, readers = record["args"], read_events(directory)
-    key = dict(zip(KEY, (args["exp_name"], args["env_id"], args["seed"])))
-    curve = read_curve(readers)
+def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
+    """Returns what a training directory's run.json and curve.csv.gz are to hold."""
+    about = json.loads((directory / "args.json").read_text(encoding="utf-8"))
+    files = sorted(directory.glob("events.out.tfevents*"))  # by their names, in the order of the run's starts
+    readers = [EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload() for file in files]  # 0: all points
+    args, curve, wall = about["args"], read_curve(readers), sum(map(read_hours, readers))
     if not len(curve):
         raise ValueError("it has no iterations")
-    # args.json has the last start's; if starts differ, each value counts once
-    starts = read_provenance(readers) or [record["provenance"]]
-    provenance = {
-        name: "; ".join(dict.fromkeys(str(start.get(name, "unknown")) for start in starts))
-        for name in record["provenance"]
-    }
-    versions = {name: version for name, version in provenance.items() if name not in PLACE}
-    run = {
-        **key,
+    provenance = read_provenance(readers, about["provenance"])
+    return {
+        "variant": args["exp_name"],
+        "game": args["env_id"],
+        "seed": args["seed"],
+        "note": "",
+        "source": directory.resolve().name,
         "steps": int(curve.index[-1]),
         "total_timesteps": args["total_timesteps"],
+        **{name: provenance.pop(name) for name in ("commit", "machine", "threads")},
+        "hours": {"wall": round(wall, 3), "core": round(wall * args["threads"], 3)},
+        "evaluation": read_evaluation(directory / "eval.csv"),
         # Without the directory that it was logged to: a path of one machine, which tells nothing of the run
-        "command": re.sub(r" --log-dir ('[^']*'|\S+)", "", record["command"]),
-        "arguments": json.dumps({name: value for name, value in args.items() if name != "log_dir"}),
-        "versions": json.dumps(versions),
-        **{name: provenance[name] for name in PLACE},
-        **read_evaluation(directory),
-    }
-    return run, curve.reset_index().assign(**key)[CURVE_COLUMNS]
-
-
-def read_events(directory: Path) -> list[EventAccumulator]:
-    """Reads a run's event files, every point of them; the order of their names is that of the run's starts."""
-    files = sorted(directory.glob("events.out.tfevents*"))
-    return [EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload() for file in files]
+        "command": re.sub(r" --log-dir ('[^']*'|\S+)", "", about["command"]),
+        "arguments": {name: value for name, value in args.items() if name != "log_dir"},
+        "versions": provenance,
+    }, curve
 
 
 def read_curve(readers: list[EventAccumulator]) -> pd.DataFrame:
@@ -125,64 +116,67 @@ def read_curve(readers: list[EventAccumulator]) -> pd.DataFrame:
     return table.assign(games_ended=np.searchsorted(np.sort(game_ends), table.index, side="right"))
 
 
-def read_provenance(readers: list[EventAccumulator]) -> list[dict[str, str]]:
-    """Returns the provenance that each start of a run wrote to TensorBoard, from the first to the last."""
-    tag, texts = "provenance/text_summary", []
+def read_provenance(readers: list[EventAccumulator], last: dict[str, object]) -> dict[str, str]:
+    """Returns what each start wrote to TensorBoard, each value once; `last` is the last start's, from args.json."""
+    tag, starts = "provenance/text_summary", []
     for reader in readers:
-        texts += reader.Tensors(tag) if tag in reader.Tags()["tensors"] else []
-    tables = [text.tensor_proto.string_val[0].decode() for text in texts]
-    return [dict(line.strip("|").split("|", 1) for line in table.splitlines()) for table in tables]
+        for text in reader.Tensors(tag) if tag in reader.Tags()["tensors"] else []:
+            lines = text.tensor_proto.string_val[0].decode().splitlines()
+            starts.append(dict(line.strip("|").split("|", 1) for line in lines))
+    values = {name: [str(start.get(name, "unknown")) for start in starts or [last]] for name in last}
+    return {name: "; ".join(dict.fromkeys(of_starts)) for name, of_starts in values.items()}
 
 
-def read_evaluation(directory: Path) -> dict[str, float]:
-    """Returns the columns of the last evaluation in a run's eval.csv; an earlier one may have had the same games."""
-    scores: list[float] = []
-    if (directory / "eval.csv").exists():
-        with open(directory / "eval.csv", encoding="utf-8", newline="") as file:
-            for row in csv.DictReader(file):
-                scores = [] if row["game"] == "1" else scores
-                scores.append(float(row["score"]))
-    std = np.std(scores, ddof=1) if len(scores) > 1 else np.nan
-    return dict(zip(EVALUATION, (len(scores), np.mean(scores), std) if scores else (np.nan,) * 3))
+def read_hours(reader: EventAccumulator) -> float:
+    """Returns the hours of one start of a run, from its first event to its last; pauses lie between two starts."""
+    first = reader.FirstEventTimestamp()
+    last = max((reader.Scalars(tag)[-1].wall_time for tag in reader.Tags()["scalars"]), default=first)
+    return (last - first) / 3600
 
 
-def read_csvs(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Returns OUT/runs.csv and OUT/curves.csv, without rows if they are not there yet."""
-    tables = []
-    whole = dict.fromkeys(("seed", "steps", "total_timesteps", "step", "games_ended"), "int64")
-    measured = dict.fromkeys((*TAGS, *EVALUATION), "float64")  # may be empty, and in older CSVs missing
-    for name, columns in (("runs.csv", RUN_COLUMNS), ("curves.csv", CURVE_COLUMNS)):
-        types = {column: (whole | measured).get(column, "str") for column in columns}
-        try:
-            table = pd.read_csv(out / name, dtype=types, encoding="utf-8")
-        except FileNotFoundError:
-            table = pd.DataFrame({column: pd.Series(dtype=dtype) for column, dtype in types.items()})
-        except (OSError, ValueError) as error:
-            refuse(f"--out {out / name}", f"cannot be read ({str(error).splitlines()[0]})")
-        if not set(columns) - set(measured) <= set(table) <= set(columns):
-            refuse(f"--out {out / name}", "has other columns than this command writes; move it away")
-        tables.append(table.reindex(columns=columns))
-    return tuple(tables)
+def read_evaluation(file: Path) -> dict[str, float | None] | None:
+    """Returns games, mean and sample standard deviation of the last evaluation in eval.csv, None without one."""
+    if not file.exists():
+        return None
+    table = pd.read_csv(file, encoding="utf-8")
+    last = table[table.index >= table.index[table.game == 1].max()]  # each evaluation begins with game 1
+    mean, std = (float(f"{number:.6g}") for number in (last.score.mean(), last.score.std(ddof=1)))
+    return {"games": len(last), "mean": mean, "std": std if len(last) > 1 else None}
 
 
-def read_grid(out: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Collects what is under OUT and returns its CSVs. Ends the program with status 2 if there is nothing."""
-    if not (out / "runs").is_dir() and not (out / "curves.csv").exists():
-        refuse(f"--out {out}", "has neither runs nor their CSVs; run benchmark/atari5.py first")
-    collect(out)
-    runs, curves = read_csvs(out)
-    if runs.empty or curves.empty:
-        refuse(f"--out {out}", "no run there has an iteration yet")
+def write_run(path: Path, record: dict, curve: pd.DataFrame) -> None:
+    """Writes a run directory, run.json last: one that has it is whole. Equal content gives equal bytes."""
+    path.mkdir(parents=True, exist_ok=True)
+    rows = curve.to_csv(float_format="%.6g", lineterminator="\n")
+    write_file(path / "curve.csv.gz", gzip.compress(rows.encode(), mtime=0))
+    write_file(path / "run.json", json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+
+
+def read_records(out: Path) -> dict[Path, dict]:
+    """Returns run directory → what its run.json holds, of all notes."""
+    files = sorted((out / "runs").glob("*/run.json"))
+    return {file.parent: json.loads(file.read_text(encoding="utf-8")) for file in files}
+
+
+def read_runs(out: Path, note: str = "") -> tuple[Runs, Curves]:
+    """Returns the runs that have this note, and their curves."""
+    runs, curves = {}, {}
+    for path, record in read_records(out).items():
+        if record["note"] == note:
+            key = record["variant"], record["game"], record["seed"]
+            curve = pd.read_csv(path / "curve.csv.gz", index_col="step", encoding="utf-8")
+            runs[key], curves[key] = record, curve.reindex(columns=[*TAGS, "games_ended"])  # older runs lack some
     return runs, curves
 
 
 def main() -> None:
-    args = parse(Args, description=__doc__)
-    try:
-        runs, curves = read_grid(args.out)
-    except OSError as error:
-        refuse(f"--out {args.out}", f"cannot use {error.filename} ({error.strerror})")
-    tell(f"{args.out}: {len(runs)} runs, {len(curves):,} iterations")
+    args = tyro.cli(Args, description=__doc__)
+    paths = collect(args.out, args.training_directories, args.note)
+    if not paths:
+        usage_error(
+            f"--out {args.out}", "nothing to collect; give training directories in which an iteration has ended"
+        )
+    print(*paths, sep="\n")
 
 
 if __name__ == "__main__":

@@ -221,7 +221,7 @@ def coverage(stage: Stage) -> str:
         text += f" They took {min(hours):.1f} to {max(hours):.1f} hours (known of {len(hours)})."
     if left_out := [f"{key[1]} {key[0]} {key[2]}" for key in stage.drawn if key not in stage.compared]:
         text += f" Only in the figures, being shorter than half of their game's longest: {', '.join(left_out)}."
-    scripts = {(run["variant"], run["versions"].get("script")) for run in runs}
+    scripts = {(key[0], run["versions"].get("script")) for key, run in stage.runs.items()}
     if len(scripts) > len({variant for variant, _ in scripts}):
         text += " Some runs of a variant were trained by different versions of its script."
     bf16 = [f"{game} {name} {seed}" for (name, game, seed), run in stage.runs.items() if run["arguments"].get("bf16")]

@@ -19,8 +19,6 @@ from benchmark import claims, collect, figures, readme, report
 from conftest import ROOT
 
 BATCH = 1024  # agent steps of an iteration
-
-
 EPSILONS = {"acppo": {"clip_coef": 0.16, "c": 1.0}, "mine": {"clip_coef": 0.2}, "product": {"c": "inf"}, "without": {}}
 
 
@@ -71,13 +69,13 @@ def make_stages(runs: dict[tuple, dict], iterations: int | None = None, bf16=(),
     return claims.make_stages(records, curves, **pair)
 
 
-def make_pairs(differences: dict[str, list[float]], iterations: int = 2, **acppo) -> claims.Stage:
+def make_pairs(differences: dict[str, list[float]], iterations: int = 2) -> claims.Stage:
     """Returns the one stage of a pair for each final difference of scores, by game."""
     runs = {}
     for game, of_game in differences.items():
         for seed, difference in enumerate(of_game, start=1):
             runs["ppo", game, seed] = {"mean_return_100": [0, 10]}
-            runs["acppo", game, seed] = {"mean_return_100": [0, 10 + difference], **acppo}
+            runs["acppo", game, seed] = {"mean_return_100": [0, 10 + difference]}
     (stage,) = make_stages(runs, iterations)
     return stage
 
@@ -96,25 +94,19 @@ def cells(markdown: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-# ------------------------------------------------------------------------------------------- training directories
 def test_all_points_of_a_curve_are_read(tmp_path):
     """By itself, TensorBoard's reader keeps 10,000 of them."""
     _, curve = collect.read_training(make_training(tmp_path, kl=range(10_001)))
     assert list(curve.index) == [BATCH * i for i in range(1, 10_002)] and list(curve.kl) == list(range(10_001))
 
 
-def test_a_step_logged_twice_keeps_what_was_written_last(tmp_path):
+def test_a_step_logged_twice_counts_once_and_a_pause_takes_no_hours(tmp_path):
     directory = make_training(tmp_path, kl=[1, 2, 3, 4])
     log(directory, {"losses/kl": {3: 30, 4: 40, 5: 50}, "losses/grad_norm": {5: 0.5}}, start=2)
     record, curve = collect.read_training(directory)
     assert list(curve.kl) == [1, 2, 30, 40, 50] and record["steps"] == 5 * BATCH
     assert curve.grad_norm.iloc[-1] == 0.5 and curve.grad_norm[:-1].isna().all()
-
-
-def test_hours_leave_out_the_pause_between_two_starts(tmp_path):
-    directory = make_training(tmp_path, kl=[1, 2, 3])
-    log(directory, {"losses/kl": {4: 4}}, start=2)
-    assert collect.read_training(directory)[0]["hours"] == {"wall": 7.0, "core": 14.0}  # two threads
+    assert record["hours"] == {"wall": 4 + 5, "core": 2 * (4 + 5)}  # two threads
 
 
 def test_games_count_from_where_they_end_and_starts_where_they_differ(tmp_path):
@@ -134,11 +126,10 @@ def test_the_last_evaluation_counts_without_the_one_before(tmp_path):
     (directory / "eval.csv").write_text("step,game,score,length\n" + "".join(f"1024,{n},{s},99\n" for n, s in games))
     evaluation = collect.read_training(directory)[0]["evaluation"]
     assert evaluation == {"games": 3, "mean": 30, "std": 26.4575}
-    table = report.evaluation_table({("ppo", "CartPole-v1", 1): {"evaluation": evaluation}})
-    assert cells(table)[2:] == [["CartPole-v1", "ppo", "1", "30.0 ± 26.5", "3"]]
+    table = cells(report.evaluation_table({("ppo", "Pong", 1): {"evaluation": evaluation}}))
+    assert table[2:] == [["Pong", "ppo", "1", "30.0 ± 26.5", "3"]]
 
 
-# ------------------------------------------------------------------------------------------------ run directories
 def test_a_run_is_its_record_and_a_curve_of_six_digits(tmp_path):
     make_training(tmp_path, "acppo", seed=7, kl=[1 / 3, 1e-5 / 3], mean_return_100=[9, 10])
     (path,) = collect.collect(tmp_path)
@@ -152,8 +143,8 @@ def test_a_run_is_its_record_and_a_curve_of_six_digits(tmp_path):
     assert list(rows.columns) == ["step", *collect.TAGS, "games_ended"]
     assert list(rows.kl) == ["0.333333", "3.33333e-06"] and list(rows.mean_return_100) == ["9", "10"]
     assert (path / "curve.csv.gz").read_bytes()[4:8] == bytes(4)  # gzip's time of writing
-    (path / "curve.csv.gz").write_bytes(gzip.compress(b"step,kl,games_ended\n1024,0.5,3\n"))  # as older runs
-    ((_, curve),) = collect.read_runs(tmp_path)[1].items()
+    (path / "curve.csv.gz").write_bytes(gzip.compress(b"step,kl,games_ended\n1024,0.5,3\n"))  # lacks what is newer
+    (curve,) = collect.read_runs(tmp_path)[1].values()
     assert list(curve.columns) == [*collect.TAGS, "games_ended"] and curve.kl[1024] == 0.5
 
 
@@ -161,18 +152,17 @@ def test_a_new_run_adds_files_and_an_older_one_is_updated(tmp_path):
     first = make_training(tmp_path, seed=1, kl=[1, 2])
     collect.collect(tmp_path)
     before = contents(tmp_path / "runs")
-    second = make_training(tmp_path, "of my own", seed=2, kl=[3])
+    second = make_training(tmp_path, "two words", seed=2, kl=[3])
     collect.collect(tmp_path, [second], note="later")
     after = contents(tmp_path / "runs")
     assert before.items() <= after.items()
-    assert {name.split("/")[0] for name in after.keys() - before.keys()} == {"CartPole-v1__of-my-own__2__later"}
+    assert {name.split("/")[0] for name in after.keys() - before.keys()} == {"CartPole-v1__two-words__2__later"}
     collect.collect(tmp_path)  # each stays where it is
     assert contents(tmp_path / "runs") == after
     log(first, {"losses/kl": {3: 3}}, start=2)
     collect.collect(tmp_path)
     changed = {name for name, data in contents(tmp_path / "runs").items() if data != after.get(name)}
     assert changed == {"CartPole-v1__ppo__1/run.json", "CartPole-v1__ppo__1/curve.csv.gz"}
-    assert [len(collect.read_runs(tmp_path, note)[0]) for note in ("", "later", "other")] == [1, 1, 0]
 
 
 def test_another_run_with_the_same_key_needs_a_note(tmp_path, monkeypatch, capfd):
@@ -191,22 +181,15 @@ def test_another_run_with_the_same_key_needs_a_note(tmp_path, monkeypatch, capfd
 
 
 def test_a_directory_that_is_no_run_is_left_out(tmp_path, capfd):
-    make_training(tmp_path, kl=[1])
     (make_training(tmp_path, seed=2, kl=[1]) / "args.json").write_text("{")
     (make_training(tmp_path, seed=3, kl=[1]) / "args.json").unlink()
-    make_training(tmp_path, seed=4)
-    assert len(collect.collect(tmp_path)) == 1
-    err = capfd.readouterr().err.splitlines()
-    assert len(err) == 3 and all("left out" in line for line in err)
+    assert collect.collect(tmp_path, [make_training(tmp_path, seed=4), make_training(tmp_path, kl=[1])])
+    assert len(collect.collect(tmp_path)) == 1 and capfd.readouterr().err.count("left out") == 1 + 3
 
 
-# -------------------------------------------------------------------------------------------------- statistics
-@pytest.mark.parametrize(
-    ("values", "mean"),
-    [([5], 5), ([1, 2], 1.5), ([100, 0, 1, 2], 1.5), ([0, 1, 2, 5, 100], (0.75 * 1 + 2 + 0.75 * 5) / 2.5)],
-)
-def test_interquartile_mean_weighs_borders_by_their_part_inside(values, mean):
-    assert claims.interquartile_mean(np.array(values, dtype=float)) == pytest.approx(mean)
+def test_interquartile_mean_weighs_borders_by_their_part_inside():
+    for values, mean in (([5], 5), ([1, 2], 1.5), ([100, 0, 1, 2], 1.5), ([0, 1, 2, 5, 100], (0.75 + 2 + 3.75) / 2.5)):
+        assert claims.interquartile_mean(np.array(values, dtype=float)) == pytest.approx(mean)
 
 
 def test_interval_is_that_of_all_ways_to_redraw_seeds_within_games():
@@ -216,7 +199,6 @@ def test_interval_is_that_of_all_ways_to_redraw_seeds_within_games():
     low, high = claims.bootstrap_interval(strata)
     assert np.mean(np.less(means, low - 1e-9)) < 0.03 and np.mean(np.less(means, low + 1e-9)) > 0.02
     assert np.mean(np.greater(means, high + 1e-9)) < 0.03 and np.mean(np.greater(means, high - 1e-9)) > 0.02
-    assert (low, high) == claims.bootstrap_interval(strata)
     # Across games 0 and 10 would mix; within a game there is nothing to mix
     assert claims.bootstrap_interval([np.zeros(3), np.full(3, 10.0)]) == (5, 5)
     assert claims.bootstrap_interval([np.zeros(3), np.zeros(1)]) is None
@@ -238,17 +220,15 @@ def test_stages_compare_each_game_at_one_step():
     assert list(finished.drawn) == [("ppo", "Pong", 1), ("acppo", "Pong", 1)]
     assert [list(curve.kl) for curve in finished.compared.values()] == [list(range(90))] * 2
     # The figures show them as far as the longest unfinished one, a finished one's first steps too
-    drawn = {key: len(curve) for key, curve in unfinished.drawn.items()}
+    drawn, compared = ({key: len(curve) for key, curve in c.items()} for c in (unfinished.drawn, unfinished.compared))
     assert drawn == {**lengths, ("ppo", "Pong", 1): 88, ("acppo", "Pong", 1): 88}
-    compared = {key: len(curve) for key, curve in unfinished.compared.items()}
     assert compared == {**dict.fromkeys(pong, 44), ("ppo", "Qbert", 1): 3}
     assert "being shorter than half of their game's longest: Pong ppo 3." in report.coverage(unfinished)
     assert "2 runs, at 90 % to 100 % of a schedule of 102,400 agent steps. All in float32." in report.coverage(finished)
 
 
 def test_spike_rates_are_as_counted_by_hand():
-    ppo = [1] * 93 + [9] * 2 + [20] * 5  # 99th percentile 20, median 1
-    acppo = [1] * 97 + [30] * 3
+    ppo, acppo = [1] * 93 + [9] * 2 + [20] * 5, [1] * 97 + [30] * 3  # 99th percentile of the first 20, medians 1
     (stage,) = make_stages({("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}})
     margins = claims.find_margins(stage)
     assert margins["relative spikes"]["Pong"] == pytest.approx([0 - 0.03])
@@ -258,49 +238,27 @@ def test_spike_rates_are_as_counted_by_hand():
     # The TV distance is 0.1: above PPO's 0.1 / 2, above AC-PPO's 0.16 / 2
     assert ppo_row == ["Pong", "ppo", "1", "102,400", "2.11", "1", "20", "20", "0.00%", "5.00%", "100.00%", "0.1000"]
     assert acppo_row[4:] == ["1.87", "1", "30", "30", "3.00%", "3.00%", "100.00%", "0.1000"]
+    seeds = {("ppo", "Pong", 1): {"kl": [1] * 100}, ("ppo", "Pong", 2): {"kl": [1] * 90 + [9] * 10}}
+    assert claims.spike_limit(make_stages(seeds)[0], "Pong") == 9  # of all seeds
 
 
-def test_a_relative_spike_is_above_what_all_seeds_of_ppo_have():
-    kl = {("ppo", "Pong", 1): [1] * 100, ("ppo", "Pong", 2): [1] * 90 + [9] * 10, ("acppo", "Pong", 1): [1] * 99 + [5]}
-    (stage,) = make_stages({key: {"kl": values} for key, values in kl.items()})
-    assert claims.find_margins(stage)["relative spikes"]["Pong"] == [0]  # a 5 is one only for seed 1; 2 has no pair
-
-
-# ---------------------------------------------------------------------------------------------------- the verdicts
-@pytest.mark.parametrize(
-    ("differences", "judged"),
-    [
-        ([1, 2, 3], "✓ 3 of 3"),
-        ([-1, -2, -3], "✗ 0 of 3"),
-        ([1, 2, -3], "? 2 of 3"),
-        ([1, 2, 0], "? 2 of 3, 1 equal"),
-        ([1, 2], "? 2 of 2"),
-        ([math.nan, 1, 1, 1], "✓ 3 of 3"),
-    ],
-)
-def test_a_claim_holds_on_a_game_where_three_pairs_all_agree(differences, judged):
-    header, _, score, *_ = cells(report.claims_table(make_pairs({"Pong": differences})))
-    assert header == ["claim", "Pong", "across games"]
-    assert score == ["AC-PPO's final score is above PPO's", judged, "–"]
+def test_a_claim_holds_on_a_game_where_three_pairs_all_agree():
+    differences = ([1, 2, 3], [-1, -2, -3], [1, 2, -3], [1, 2, 0], [1, 2], [math.nan, 1, 1, 1])
+    tables = [cells(report.claims_table(make_pairs({"Pong": of_game}))) for of_game in differences]
+    judged = ["✓ 3 of 3", "✗ 0 of 3", "? 2 of 3", "? 2 of 3, 1 equal", "? 2 of 2", "✓ 3 of 3"]
+    assert [table[2] for table in tables] == [["AC-PPO's final score is above PPO's", cell, "–"] for cell in judged]
 
 
 @pytest.mark.parametrize(
-    ("pong", "breakout", "judged"),
-    [
-        ([5, 6, 7], [1, 2, 3], "✓ holds"),
-        ([-5, -6, -7], [-1, -2, -3], "✗ does not hold"),
-        ([5, 6, 7], [-4, -5, -6], "? cannot be told apart with these runs"),
-        ([5, 6, 7], [1, 2], "? cannot be told apart with these runs"),
-        ([5, 6, 7], [1], "? cannot be told apart with these runs"),
-    ],
+    ("breakout", "judged"),
+    [([1, 2, 3], "✓ holds"), ([-4, -5, -6], f"? {claims.UNDECIDED}"), ([1, 2], f"? {claims.UNDECIDED}")],
 )
-def test_a_claim_is_judged_across_games_by_its_interval(pong, breakout, judged):
-    stage = make_pairs({"Pong": pong, "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
-    strata = [np.array(breakout) / (30.5 - 1.7), np.array(pong) / (14.6 + 20.7)]  # CartPole has no human score
+def test_a_claim_is_judged_across_games_by_its_interval(breakout, judged):
+    stage = make_pairs({"Pong": [5, 6, 7], "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
+    strata = [np.array(breakout) / (30.5 - 1.7), np.array([5, 6, 7]) / (14.6 + 20.7)]  # CartPole has no human score
     mean, interval = claims.interquartile_mean(np.concatenate(strata)), claims.bootstrap_interval(strata)
-    shown = "no interval: one seed" if interval is None else "{:+.3f} to {:+.3f}".format(*interval)
-    across = cells(report.claims_table(stage))[2][-1]
-    assert across == f"{judged}: {mean:+.3f} of human minus random score ({shown})"
+    shown = "{:+.3f} of human minus random score ({:+.3f} to {:+.3f})".format(mean, *interval)
+    assert cells(report.claims_table(stage))[2][-1] == f"{judged}: {shown}"
     assert cells(report.human_table(stage))[-1][3] == f"{mean:.3f}"
 
 
@@ -316,25 +274,21 @@ def test_a_final_score_waits_for_90_percent_of_the_schedule():
 @pytest.mark.parametrize(
     ("baseline", "challenger", "base", "new", "near", "signs"),
     [
-        ("ppo", "acppo", "PPO", "AC-PPO", "PPO's ε, 0.1 (0.08 to 0.12)", "✗✗✗?✓"),
-        ("ppo", "mine", "PPO", "mine", "PPO's ε, 0.1 (0.08 to 0.12)", "✓✓??✗"),
-        ("mine", "ppo", "mine", "PPO", "mine's ε, 0.2 (0.18 to 0.22)", "✗✗✗?✗"),
+        ("ppo", "acppo", "PPO", "AC-PPO", "0.1 (0.08 to 0.12)", "✗✗✗?✓"),
+        ("ppo", "mine", "PPO", "mine", "0.1 (0.08 to 0.12)", "✓✓??✗"),
+        ("mine", "ppo", "mine", "PPO", "0.2 (0.18 to 0.22)", "✗✗✗?✗"),
     ],
 )
 def test_verdicts_are_on_the_variants_that_are_named(baseline, challenger, base, new, near, signs):
-    columns = {
-        "ppo": {"mean_return_100": [0, 10], "kl": [1, 5], "avg_clip_ratio": 0.1},
-        "acppo": {"mean_return_100": [0, 9], "kl": [6, 6], "avg_clip_ratio": 0.11},
-        "mine": {"mean_return_100": [0, 12], "kl": [1, 1], "avg_clip_ratio": 0.13},
-    }
+    columns = {"ppo": ([0, 10], [1, 5], 0.1), "acppo": ([0, 9], [6, 6], 0.11), "mine": ([0, 12], [1, 1], 0.13)}
+    columns = {name: dict(zip(("mean_return_100", "kl", "avg_clip_ratio"), of)) for name, of in columns.items()}
     runs = {(variant, "Pong", seed): columns[variant] for variant in columns for seed in (1, 2, 3)}
     (stage,) = make_stages(runs, baseline=baseline, challenger=challenger)
     rows = cells(report.claims_table(stage))[2:]
     assert rows[0][0] == f"{new}'s final score is above {base}'s"
-    assert rows[-1][0] == f"{new}'s average clip ratio is near {near}"
+    assert rows[-1][0] == f"{new}'s average clip ratio is near {base}'s ε, {near}"
     assert "".join(row[1][0] for row in rows) == signs
-    header, _, pong = cells(report.short_table([stage]))
-    assert header[3:] == [base, new, f"{base}'s KL ÷ {new}'s", f"{new} scores more"] and pong[-1][0] == signs[0]
+    assert cells(report.short_table([stage]))[0][3:] == [base, new, f"{base}'s KL ÷ {new}'s", f"{new} scores more"]
     assert f"| {challenger} − {baseline}, by pairs |" in report.results_part([stage])
 
 
@@ -345,18 +299,14 @@ def test_a_variant_without_an_epsilon_has_no_verdict_on_it(variant):
     claim = cells(report.claims_table(stage))[-1]
     assert claim[:2] == [f"PPO's average clip ratio is near {variant}'s ε, which no run has", "? 0 of 0"]
     lines = figures.draw_figure("avg_clip_ratio", stage).axes[0].lines
-    assert not [line for line in lines if line.get_linestyle() == "--"]
+    assert "--" not in {line.get_linestyle() for line in lines}
 
 
-# -------------------------------------------------------------------------------------------------- the other tables
 def test_the_score_table_says_where_games_are_few():
-    runs = {
-        ("ppo", "BattleZone", 1): {"mean_return_100": [0, 10], "games_ended": [9, 120]},
-        ("ppo", "BattleZone", 2): {"mean_return_100": [0, 20], "games_ended": [8, 99]},
-        ("acppo", "BattleZone", 1): {"mean_return_100": [0, 12], "games_ended": [8, 100]},
-        ("acppo", "CartPole-v1", 1): {"mean_return_100": [math.nan, math.nan], "games_ended": 0},
-    }
-    (stage,) = make_stages(runs)
+    ends = {("ppo", "BattleZone", 1): (10, 120), ("ppo", "BattleZone", 2): (20, 99)}
+    ends |= {("acppo", "BattleZone", 1): (12, 100), ("acppo", "CartPole-v1", 1): (math.nan, 0)}
+    columns = {key: {"mean_return_100": [0, score], "games_ended": [0, count]} for key, (score, count) in ends.items()}
+    (stage,) = make_stages(columns)
     header, _, battle_zone, cartpole = cells(report.score_table(stage.compared))
     assert header == ["game", "agent steps", "ppo", "acppo", "random", "human"]
     assert battle_zone[:4] == ["BattleZone", "2,048", "15.0 ± 7.1 (n = 2, 99 games)", "12.0 (n = 1)"]
@@ -368,16 +318,10 @@ def test_the_score_table_says_where_games_are_few():
 @pytest.mark.parametrize(("schedule", "ended"), [(20, 10), (38, 5), (40, 5), (42, 0)])
 def test_progress_is_told_in_tenths_once_all_have_done_half(schedule, ended):
     (stage,) = make_stages({("ppo", "Pong", 1): {"mean_return_100": range(20), "kl": [1, 3] * 10}}, iterations=schedule)
-    table = cells(report.progress_table(stage))
-    assert bool(table) == bool(ended)  # a tenth that has not ended is left out
-    if ended:
-        assert table[2][1:] == [
-            "score",
-            *(str(schedule * i // 10 - 1) for i in range(1, ended + 1)),
-            *["–"] * (10 - ended),
-        ]
-    if schedule in (20, 40):
-        assert table[3][1:] == ["KL", *["2"] * ended, *["–"] * (10 - ended)]
+    score, kl = cells(report.progress_table(stage))[2:] or ((), ())
+    assert list(kl).count("–") == (10 - ended if ended else 0)  # those tenths have not ended
+    assert list(score[2 : 2 + ended]) == [str(schedule * i // 10 - 1) for i in range(1, ended + 1)]
+    assert schedule % 20 or list(kl[2 : 2 + ended]) == ["2"] * ended
 
 
 def test_the_short_table_has_each_games_most_advanced_pairs():
@@ -395,30 +339,22 @@ def test_the_short_table_has_each_games_most_advanced_pairs():
 def test_coverage_says_where_runs_differ_and_what_they_took():
     keys = [("ppo", "Pong", 1), ("acppo", "Pong", 1), ("ppo", "Pong", 2)]
     (stage,) = make_stages({key: {"kl": [1]} for key in keys}, bf16=keys[:2])
-    assert report.coverage(stage).endswith("In bfloat16: Pong ppo 1, Pong acppo 1; the others in float32.\n")
-    assert "versions of its script" not in report.coverage(stage)
-    stage.runs[keys[0]] |= {"versions": {"script": "sha256 a"}, "hours": {"wall": 3.14, "core": 3.14}}
-    stage.runs[keys[2]] |= {"versions": {"script": "sha256 b"}}
-    assert "different versions of its script" in report.coverage(stage)
-    assert "They took 3.1 to 3.1 hours (known of 1)." in report.coverage(stage)
+    assert report.coverage(stage).endswith("steps. In bfloat16: Pong ppo 1, Pong acppo 1; the others in float32.\n")
+    for key in keys:
+        stage.runs[key] |= {"versions": {"script": f"sha256 {key[2]}"}, "hours": {"wall": key[2]}}
+    assert "They took 1.0 to 2.0 hours (known of 3). Some runs of a variant" in report.coverage(stage)
 
 
-# -------------------------------------------------------------------------------------------------------- figures
 def test_mean_and_band_end_where_the_shortest_run_does():
-    def draw(column: str, of_seeds: list) -> Figure:
-        runs = {("ppo", "Pong", seed): {column: values} for seed, values in enumerate(of_seeds, start=1)}
+    for column in ("mean_return_100", "kl"):
+        runs = {("ppo", "Pong", 1): {column: [1, 2, 3]}, ("ppo", "Pong", 2): {column: [3, 6]}}
         (stage,) = make_stages(runs, iterations=1000)
-        axis = Figure().subplots()
-        figures.draw_panel(axis, stage.drawn, "Pong", column, frames=4)
-        return axis
-
-    axis = draw("mean_return_100", [[1, 2, 3], [3, 6]])
-    np.testing.assert_equal(axis.lines[-1].get_ydata(), [2, 4, math.nan])
-    assert list(axis.lines[-1].get_xdata()) == [4 * BATCH * i for i in (1, 2, 3)]
-    band = axis.collections[0].get_paths()[0].vertices
-    assert band[:, 1].min() == pytest.approx(2 - math.sqrt(2)) and band[:, 1].max() == pytest.approx(4 + math.sqrt(8))
-    drawn = draw("kl", [range(1, 61), range(1, 41)]).lines[-1].get_ydata()
-    assert np.isfinite(drawn[:40]).all() and np.isnan(drawn[40:]).all()
+        figures.draw_panel(axis := Figure().subplots(), stage.drawn, "Pong", column, frames=4)
+        np.testing.assert_equal(axis.lines[-1].get_ydata(), [2, 4, math.nan])
+        assert list(axis.lines[-1].get_xdata()) == [4 * BATCH * i for i in (1, 2, 3)]
+        if column == "mean_return_100":
+            band = axis.collections[0].get_paths()[0].vertices[:, 1]
+            assert (band.min(), band.max()) == pytest.approx((2 - math.sqrt(2), 4 + math.sqrt(8)))
 
 
 def test_a_figure_says_games_seeds_units_and_keeps_its_colours(tmp_path):
@@ -438,7 +374,6 @@ def test_a_figure_says_games_seeds_units_and_keeps_its_colours(tmp_path):
     assert (dashed.get_ydata()[0], dashed.get_color()) == (0.1, figures.COLOURS["ppo"])
 
 
-# ------------------------------------------------------------------------------------------------- whole calls
 def test_a_call_writes_its_set_and_equal_input_gives_equal_bytes(tmp_path, monkeypatch):
     out = tmp_path / "results"
     monkeypatch.setattr(report, "ROOT", tmp_path)
@@ -452,8 +387,7 @@ def test_a_call_writes_its_set_and_equal_input_gives_equal_bytes(tmp_path, monke
     made, stages = contents(tmp_path), claims.make_stages(*collect.read_runs(out))
     assert made["results/README.md"].decode() == marks.replace("old\n", report.results_part(stages))
     assert made["README.md"].decode() == marks.replace("old\n", report.short_table(stages))
-    pictures = {f"results/figures/unfinished/{name}.png" for name in figures.FIGURES}
-    assert {name for name in made if name.endswith(".png")} == pictures
+    assert made.keys() > {f"results/figures/unfinished/{name}.png" for name in figures.FIGURES}
     call(monkeypatch, report, "--out", out)
     assert contents(tmp_path) == made
 
@@ -470,21 +404,14 @@ def test_a_call_writes_its_set_and_equal_input_gives_equal_bytes(tmp_path, monke
 
 @pytest.mark.parametrize(
     ("flags", "words"),
-    [
-        (["--out", "nowhere"], "no run there has no note"),
-        (["--note", "none"], "no run there has the note none"),
-        (["--note", "a/b"], "give letters"),
-        (["--challenger", "thine"], "no run is of it; give one of ppo"),
-        ([], "to write between"),  # the page has lost its marks
-    ],
+    [("--note none", "the note none"), ("--note a/b", "letters"), ("--challenger x", "one of ppo"), ("", "between")],
 )
 def test_bad_input_is_refused_in_one_line(flags, words, tmp_path, monkeypatch, capfd):
     collect.collect(tmp_path, [make_training(tmp_path / "elsewhere", kl=[1], mean_return_100=[1])])
     (tmp_path / "README.md").write_text("<!-- end results -->\n<!-- results -->\n")
     before = contents(tmp_path)
-    monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as ended:
-        call(monkeypatch, report, "--out", tmp_path, *flags)
+        call(monkeypatch, report, "--out", tmp_path, *flags.split())  # without flags: the page has lost its marks
     out, err = capfd.readouterr()
     assert (ended.value.code, out, err.count("\n")) == (2, "", 1) and words in err
     assert contents(tmp_path) == before

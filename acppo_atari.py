@@ -141,8 +141,6 @@ class Agent(nn.Module):
     def __init__(self, obs_shape: tuple[int, ...], num_actions: int, bf16: bool = False):
         super().__init__()
         self.bf16 = bf16
-        if len(obs_shape) != 1 and obs_shape[1:] != (84, 84):
-            raise ValueError(f"observations of shape {obs_shape}; give (channels, 84, 84) or (size,)")
         if len(obs_shape) == 3:
             self.network = nn.Sequential(
                 orthogonal(nn.Conv2d(obs_shape[0], 32, 8, stride=4)),
@@ -250,7 +248,7 @@ def compute_gae(rewards, values, next_values, terminations, truncations, gamma: 
     """
     deltas = rewards + gamma * next_values * ~terminations - values  # δ_t
     not_done = ~(terminations | truncations)  # the sum of an episode stops at its end
-    advantages = torch.zeros_like(deltas)  # whatever the rewards' dtype
+    advantages = torch.zeros_like(deltas)  # in floats, also for whole-number rewards
     last_advantage = torch.zeros_like(deltas[0])
     for t in reversed(range(len(rewards))):
         advantages[t] = last_advantage = deltas[t] + gamma * gae_lambda * not_done[t] * last_advantage
@@ -322,13 +320,13 @@ def train(
     torch.set_num_threads(args.threads)
     agent = make_agent(args, envs)
     device = next(agent.parameters()).device
-    # eps as in OpenAI's baselines, not torch's 1e-8; fused: a quarter of the time (benchmark/tricks.py)
+    # eps as in OpenAI's baselines, not torch's 1e-8; fused, it takes a quarter of the time (benchmark/tricks.py)
     optimizer = torch.optim.Adam(agent.parameters(), lr=args.learning_rate, eps=1e-5, fused=True)
     iterations_done = run.start(args, state, agent, optimizer)
     run.save(args, iterations_done, agent, optimizer)  # to be resumed from at once; counts this start
     vf_clip_coef = args.vf_clip_coef if args.clip_vloss else None
-    new_policy = partial(make_policy, agent, args.seed)  # a fresh generator for each film
-    bookkeeping.record_game_if_due(args, new_policy, run, iterations_done, stop)
+    fresh_policy = partial(make_policy, agent, args.seed)  # with a new generator for each film
+    bookkeeping.record_game_if_due(args, fresh_policy, run, iterations_done, stop)
 
     # Storage: T steps of N environments. Row T follows them: its observations begin the next rollout.
     T, N = args.num_steps, args.num_envs
@@ -351,13 +349,13 @@ def train(
 
         # Rollout: T steps in N environments with the current policy
         global_step = (iteration - 1) * args.batch_size  # agent steps, over all environments
-        policy = agent.snapshot()
+        snapshot = agent.snapshot()
         obs[0] = obs[T]
         games = []  # (global_step, score, length in agent steps) of each game that ends
         stopwatch.lap("rest")
         for t in range(T):
             # Copied into the storage, because tensors made under inference_mode cannot enter a loss
-            actions[t], logprobs[t], values[t] = act(policy, obs[t])
+            actions[t], logprobs[t], values[t] = act(snapshot, obs[t])
             stopwatch.lap("inference")
             next_obs, reward, terminated, truncated, infos = envs.step(actions[t].cpu().numpy())
             stopwatch.lap("environment")
@@ -368,13 +366,13 @@ def train(
             truncations[t] = torch.from_numpy(truncated)
             if truncated.any():
                 final_obs = np.stack(infos["final_obs"][truncated])  # the other rows are uninitialised memory
-                final_values[t, truncations[t]] = get_value(policy, from_envs(final_obs, device))
+                final_values[t, truncations[t]] = get_value(snapshot, from_envs(final_obs, device))
             for n in np.flatnonzero(infos.get("_episode", False)):
                 games.append((global_step, float(infos["episode"]["r"][n]), int(infos["episode"]["l"][n])))
             stopwatch.lap("rest")
 
         # Advantages, and the TD(λ) returns that the values are fitted to
-        values[T] = get_value(policy, obs[T])
+        values[T] = get_value(snapshot, obs[T])
         next_values = torch.where(truncations, final_values, values[1:])
         advantages = compute_gae(
             rewards, values[:T], next_values, terminations, truncations, args.gamma, args.gae_lambda
@@ -387,7 +385,8 @@ def train(
         stopwatch.lap("rest")
 
         # Update: several epochs of minibatch gradient steps on the rollout
-        minibatch_stats = []  # tensors, read once an iteration: .item() in here would wait for the device
+        names = ("policy_loss", "value_loss", "entropy", "clipfrac", "avg_clip_ratio", "grad_norm")
+        minibatch_stats = []  # tensors of these, read once an iteration: .item() in here would wait for the device
         for _ in range(args.update_epochs):
             minibatch_kls = []
             for mb_inds in torch.randperm(args.batch_size, device=device).split(args.minibatch_size):
@@ -431,7 +430,6 @@ def train(
         stopwatch.lap("kl_pass")
 
         # Log: once an iteration; the games at the steps where they ended
-        names = ("policy_loss", "value_loss", "entropy", "clipfrac", "avg_clip_ratio", "grad_norm")
         losses = dict(zip(names, torch.stack(minibatch_stats).mean(0).tolist(), strict=True))
         losses |= {name: value.item() for name, value in change.items()}
         broken = [name for name, value in losses.items() if not math.isfinite(value)]
@@ -444,7 +442,7 @@ def train(
         status_line.show(args, iteration, charts["charts/SPS"], run.last_scores)
 
         # Film and checkpoint
-        bookkeeping.record_game_if_due(args, new_policy, run, iteration, stop)
+        bookkeeping.record_game_if_due(args, fresh_policy, run, iteration, stop)
         stopping = stop.number != 0  # read once: a signal after this line is served after the next iteration
         if stopping or iteration == args.last_iteration or run.is_checkpoint_due():
             run.save(args, iteration, agent, optimizer)

@@ -33,7 +33,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, BinaryIO, NamedTuple
 
 import filelock
 import numpy as np
@@ -60,11 +60,11 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def print_message(text: str, end: str = "\n") -> None:
-    """Writes to standard error and ignores errors: a closed terminal or a full disk must not end a run."""
+def print_message(text: str, end: str = "\n", descriptor: int = 2) -> None:
+    """Writes to standard error, or output, and ignores errors: a closed terminal or a full disk must not end a run."""
     start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
-    with contextlib.suppress(OSError):
-        os.write(2, f"{start}{text}{end}".encode(errors="replace"))  # not print, which a signal's handler may not call
+    with contextlib.suppress(OSError):  # not `print`, which a signal's handler must not call
+        os.write(descriptor, f"{start}{text}{end}".encode(errors="replace"))
 
 
 def usage_error(given: str, advice: object) -> typing.NoReturn:
@@ -78,17 +78,26 @@ def as_flag(name: str, value: object) -> str:
     return f"--{name.replace('_', '-')} {value}"
 
 
-def write_file(path: str | os.PathLike, data: str | bytes) -> None:
-    """Replaces a file, text as UTF-8: writes a new one and renames it. At every instant one of the two is whole."""
+@contextlib.contextmanager
+def replacing(path: str | os.PathLike) -> Iterator[BinaryIO]:
+    """Gives a new file to a `with`, and renames it to `path` in the end. At every instant one of the two is whole."""
     new = f"{os.fspath(path)}.new"
     try:
         with open(new, "wb") as file:
-            file.write(data.encode() if isinstance(data, str) else data)
+            yield file
+            file.flush()
+            os.fsync(file.fileno())  # on the disk before the rename is, even if the power fails
         os.replace(new, path)
-    except OSError:
+    except (OSError, RuntimeError):  # torch turns a full disk into a RuntimeError
         with contextlib.suppress(OSError):
-            os.remove(new)  # half of it would fill the disk further
+            os.remove(new)
         raise
+
+
+def write_file(path: str | os.PathLike, data: str | bytes) -> None:
+    """Replaces a file, text as UTF-8."""
+    with replacing(path) as file:
+        file.write(data.encode() if isinstance(data, str) else data)
 
 
 def processor_kind() -> str:
@@ -104,8 +113,8 @@ def tune_process() -> None:
     """Sets up a process that trains, before it imports torch: its threads, its memory and its denormal numbers."""
     # Idle OpenMP threads would spin on the cores that the games' threads need (docs/speed.md has the measurements)
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    # glibc returns tensors of megabytes to the system and faults their pages in again, 16 times an iteration. Keeping
-    # them cuts these 16 steps from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes.
+    # glibc returns tensors of megabytes to the system and faults their pages in again at every gradient step. Keeping
+    # them cuts an iteration's 16 from 2.1 to 1.7 s. -1 is M_TRIM_THRESHOLD, -3 is M_MMAP_THRESHOLD, in bytes
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
         libc.mallopt(-1, 1 << 30)
         if not libc.mallopt(-3, 1 << 30):
@@ -170,7 +179,7 @@ NonNegativeFloat = bounded(float, lambda x: 0 <= x < 1e30, "0<=x<1e30")
 NonNegativeOrInf = bounded(float, lambda x: 0 <= x < 1e30 or x == math.inf, "0<=x<1e30|inf")
 Fraction = bounded(float, lambda x: 0 <= x <= 1, "0..1")
 Threads = bounded(int, lambda x: 0 < x <= 1024, "1..1024")
-FileName = bounded(str, lambda x: re.fullmatch(r"[\w.-]{1,100}", x), "[A-Za-z0-9_.-]{1,100}")
+FileName = bounded(str, lambda x: re.fullmatch(r"[A-Za-z0-9_.-]{1,100}", x), "[A-Za-z0-9_.-]{1,100}")
 
 
 @dataclass
@@ -216,7 +225,7 @@ def check_args(args) -> None:
     """Refuses the first argument that is out of its bounds or breaks one of `args.rules()`."""
     for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
-        for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # `X | None` has X among its args
+        for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # X, or in `X | None` its parts
             for bounds in getattr(kind, "__metadata__", ()):
                 if isinstance(bounds, Bounds) and not bounds.allow(value):
                     usage_error(as_flag(name, value), f"give a value in {bounds.shown}")
@@ -260,9 +269,8 @@ class RunDirectory:
         self.lock.acquire(blocking=False)
         self.writer = None  # of TensorBoard's event file
         self.write_errors: set[str] = set()  # what could not be written
-        self.is_training = False
         self.iteration = 0  # of the last checkpoint
-        self.num_starts = 0  # each start of a run plays games of its own
+        self.num_starts = 0  # before this one; each start of a run plays other games
         self.last_scores = deque(maxlen=100)  # raw returns of whole games
         self.checkpoint_due = 0.0
 
@@ -308,18 +316,20 @@ class RunDirectory:
             state["args"].pop("compile", None)  # the finished runs of commit 3a0949c have it, and another name for:
             state["num_starts"] = state.pop("starts", state.get("num_starts"))
             others = state["args"].keys() ^ (args_class.__dataclass_fields__.keys() - PER_CALL_ARGS)
-            whole &= all(tensor.isfinite().all().item() for tensor in state["agent"].values())
+            if not (whole and all(tensor.isfinite().all() for tensor in state["agent"].values())):
+                raise ValueError("not what was written")
         except Exception as error:  # a file that is no checkpoint can make them raise anything
             raise ValueError("its checkpoint is damaged, or not a checkpoint") from error
         if others:
             raise ValueError(f"its checkpoint is of another script, which differs in {', '.join(sorted(others))}")
-        if not whole:
-            raise ValueError("its checkpoint is damaged")
         return state
 
     def restore_agent(self, state: dict, agent) -> None:
-        """Loads the parameters of the checkpoint `state`. Raises torch's RuntimeError if they are another network's."""
-        agent.load_state_dict(state["agent"])
+        """Loads the parameters of the checkpoint `state`, or refuses those of another network."""
+        try:
+            agent.load_state_dict(state["agent"])
+        except RuntimeError as error:
+            usage_error(self.path, f"its checkpoint does not fit this script's network ({error})")
         self.iteration = state["iteration"]
 
     def start(self, args, state: dict | None, agent, optimizer) -> int:
@@ -330,9 +340,9 @@ class RunDirectory:
         """
         import torch
 
-        self.is_training = True
         if state is not None:
             self.restore_agent(state, agent)
+            # Without the groups' options: a resumed call may have another learning rate
             optimizer.load_state_dict({**optimizer.state_dict(), "state": state["optimizer"]})
             torch.set_rng_state(state["rng"][0])
             if len(state["rng"]) > 1 and next(agent.parameters()).is_cuda:
@@ -373,7 +383,10 @@ class RunDirectory:
         self.add_events([("add_scalar", *point) for point in points])
 
     def add_events(self, events: list[tuple]) -> None:
-        """Calls methods of TensorBoard's writer, (name, arguments …), and flushes it. A failed one has a successor."""
+        """Calls methods of TensorBoard's writer, (name, arguments …), and flushes it.
+
+        A writer that fails stays dead, so the next call has another, with a file of its own.
+        """
         from torch.utils.tensorboard import SummaryWriter
 
         with self.reporting("the event file"):
@@ -384,6 +397,8 @@ class RunDirectory:
                 self.writer.flush()
             except OSError:
                 self.writer = None
+                for name in (name for name, size in self.event_files().items() if size == 0):
+                    os.remove(os.path.join(self.path, name))  # a full disk would get one at every call
                 raise
 
     def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], step: int) -> None:
@@ -407,24 +422,19 @@ class RunDirectory:
         """Writes a checkpoint next to the last one and renames it: at every instant one of the two is whole."""
         import torch
 
-        new, rng = self.checkpoint + ".new", [torch.get_rng_state()]
+        rng = [torch.get_rng_state()]
         if next(agent.parameters()).is_cuda:
             rng.append(torch.cuda.get_rng_state())
-        progress = {"iteration": iteration, "global_step": iteration * args.batch_size}
-        progress |= {"num_starts": self.num_starts + 1, "last_scores": list(self.last_scores)}
-        learner = {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"], "rng": rng}
+        state = {"args": saved_args(args), "iteration": iteration, "global_step": iteration * args.batch_size}
+        state |= {"agent": agent.state_dict(), "optimizer": optimizer.state_dict()["state"], "rng": rng}
+        state |= {"num_starts": self.num_starts + 1, "last_scores": list(self.last_scores)}
         with self.reporting("the checkpoint"):
             try:
-                with open(new, "wb") as file:
-                    sizes = self.event_files()  # to which a resumed run cuts them
-                    torch.save({"args": saved_args(args), "event_files": sizes, **progress, **learner}, file)
-                    os.fsync(file.fileno())  # on the disk before the rename is, even if the power fails
-                os.replace(new, self.checkpoint)
-                self.iteration = iteration
-            except (OSError, RuntimeError) as error:  # torch turns a full disk into a RuntimeError
-                with contextlib.suppress(OSError):
-                    os.remove(new)
+                with replacing(self.checkpoint) as file:
+                    torch.save({**state, "event_files": self.event_files()}, file)  # which a resumed run cuts to that
+            except RuntimeError as error:
                 raise OSError(str(error)) from error
+            self.iteration = iteration
         self.checkpoint_due = time.perf_counter() + 60 * args.checkpoint_minutes
 
     def is_checkpoint_due(self) -> bool:
@@ -437,8 +447,7 @@ class RunDirectory:
             yield
         except OSError as error:
             if what not in self.write_errors:
-                carries_on = "; the run goes on" if self.is_training else ""
-                print_message(f"{self.path}: {what} cannot be written ({error}){carries_on}")
+                print_message(f"{self.path}: {what} cannot be written ({error}); carrying on without")
             self.write_errors.add(what)
 
     def event_files(self) -> dict[str, int]:
@@ -450,7 +459,7 @@ class RunDirectory:
 def git_commit(script: str, checkout: str | None = None) -> str:
     """Returns the commit of this checkout, or of another; `-dirty` if it has changes, or does not hold the script."""
     here = checkout or os.path.dirname(os.path.abspath(__file__))
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # a hook's
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("GIT_")}  # as in a hook
 
     def git(*words: str) -> str:
         run = subprocess.run(["git", "-C", here, *words], capture_output=True, text=True, env=environment)
@@ -571,23 +580,28 @@ def play(
     return [games[n][turn] for turn, n in numbered if turn < len(games[n])]
 
 
-def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal | None = None) -> None:
-    """Plays `args.eval_episodes` games with the policy of agent step `step`, and prints and logs their scores."""
+def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal) -> bool:
+    """Plays `args.eval_episodes` games with the policy of agent step `step`, and prints and logs their scores.
+
+    Returns False if `stop` notes a signal before the last one has ended.
+    """
     envs = make_envs(args.env_id, args.num_envs, args.threads)  # however many games: so each has its number
     games = play(policy, envs, args.eval_episodes, [args.seed, 1], stop)
     envs.close()
-    if stop is not None and stop.number:
-        return
+    if stop.number:
+        return False
     if len(games) < args.eval_episodes:
         print_message(f"{args.eval_episodes - len(games)} of {args.eval_episodes} games did not end, they are left out")
     scores = np.array([score for score, _ in games] or [math.nan])
     std = scores.std(ddof=1) if len(scores) > 1 else 0.0
     stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
     run.log_evaluation(games, stats, step)
-    print(f"{len(games)} games at step {step:,}: {' '.join(f'{name} {value:.1f}' for name, value in stats.items())}")
+    shown = " ".join(f"{name} {value:.1f}" for name, value in stats.items())
+    print_message(f"{len(games)} games at step {step:,}: {shown}", descriptor=1)
+    return True
 
 
-def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal | None = None) -> None:
+def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal) -> None:
     """Plays one game into `videos/` of the run, with its score in the file's name; none if `stop` notes a signal."""
     path = os.path.join(run.path, "videos", f"step_{step}")
     with run.reporting("the video"):
@@ -595,7 +609,7 @@ def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSi
         try:
             with contextlib.closing(make_envs(args.env_id, 1, args.threads, video=path + ".mp4")) as envs:
                 scores = [score for score, _ in play(policy, envs, 1, [args.seed, 2], stop)]
-            if stop is None or not stop.number:
+            if not stop.number:
                 result = f"score_{scores[0]:.10g}" if scores else "without_end"
                 os.replace(path + ".mp4", f"{path}_{result}.mp4")
         finally:
@@ -604,11 +618,11 @@ def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSi
 
 
 def record_game_if_due(
-    args, new_policy: Callable[[], Policy], run: RunDirectory, iteration: int, stop: StopSignal
+    args, fresh_policy: Callable[[], Policy], run: RunDirectory, iteration: int, stop: StopSignal
 ) -> None:
     """Records a game at the start, at each quarter and at the end of the training, with `--capture-video`."""
     if args.capture_video and not stop.number and iteration in [args.num_iterations * k // 4 for k in range(5)]:
-        record_game(args, new_policy(), run, iteration * args.batch_size, stop)
+        record_game(args, fresh_policy(), run, iteration * args.batch_size, stop)
 
 
 # --------------------------------------------------------------------------------------------------- command line
@@ -632,17 +646,18 @@ def open_run(args_class: type, description: str):
         if name == "evaluate":  # the run's own are for its training
             this_call |= {own: getattr(args_class(), own) for own in ("capture_video", "eval_episodes", "threads")}
         args = tyro.cli(args_class, description=description, default=replace(args_class(**state["args"]), **this_call))
-        for fixed in {"env_id", "num_envs", "num_steps", "seed", "exp_name"} - {"seed" if name == "evaluate" else ""}:
-            if getattr(args, fixed) != state["args"][fixed]:
+        for fixed in ("env_id", "num_envs", "num_steps", "exp_name", "seed"):  # an evaluation may have another seed
+            if getattr(args, fixed) != state["args"][fixed] and (fixed, name) != ("seed", "evaluate"):
                 message = f"the run has {state['args'][fixed]}, which cannot change"
                 usage_error(as_flag(fixed, getattr(args, fixed)), message)
     check_args(args)
     torch.set_num_threads(args.threads)
     if args.resume is not None and state["iteration"] >= args.last_iteration:
         limit = "--total-timesteps" if state["iteration"] >= args.num_iterations else "--stop-at"
-        print(f"{run.path} is finished up to {limit}, at step {state['global_step']}; a larger one takes it further")
+        done = f"{run.path} is finished up to {limit}, at step {state['global_step']}"
+        print_message(f"{done}; a larger one takes it further, and --evaluate plays games", descriptor=1)
         sys.exit()
-    try:
+    try:  # an evaluation has its own; of these it takes the spaces
         envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
         if args.capture_video:
             make_envs(args.env_id, 1, video="none yet").close()  # refused now, if it cannot be rendered
@@ -658,22 +673,19 @@ def open_run(args_class: type, description: str):
     return args, envs, run, state, stop
 
 
-def finish(args, new_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
+def finish(args, fresh_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
     """Ends a call whose agent is trained or loaded: evaluates it, or says how to continue. Exits with its status."""
-    run.is_training = False
-    step, evaluate_only = run.iteration * args.batch_size, args.evaluate is not None
+    step, evaluate_only = run.iteration * args.batch_size, args.evaluate is not None  # of the last checkpoint
     done = evaluate_only or run.iteration >= args.last_iteration
-    to_evaluate = evaluate_only or (run.iteration == args.num_iterations and args.eval_episodes > 0)
-    if to_evaluate and not stop.number and not run.write_errors:
-        evaluate(args, new_policy(), run, step, stop)
-        if evaluate_only and args.capture_video:  # a training has filmed its last agent already
-            record_game(args, new_policy(), run, step, stop)
-    if stop.number and not done:
-        stop_at = [] if args.stop_at is None else ["--stop-at", str(args.stop_at)]
-        print_message(f"Stopped; continue with: {call_command(args, '--resume', run.path, *stop_at)}")
-    elif to_evaluate and (stop.number or run.write_errors):
-        print_message(f"Not evaluated; do that with: {call_command(args, '--evaluate', run.path)}")
-    elif done and run.iteration < args.num_iterations and not evaluate_only:
-        print_message(f"At --stop-at; continue with: {call_command(args, '--resume', run.path)}")
-    cut_short = stop.number and (to_evaluate or not done)
+    cut_short = stop.number and not done
+    if evaluate_only or (run.iteration == args.num_iterations and args.eval_episodes > 0):
+        if stop.number or not evaluate(args, fresh_policy(), run, step, stop):
+            print_message(f"Not evaluated; do that with: {call_command(args, '--evaluate', run.path)}")
+            cut_short = True
+        elif evaluate_only and args.capture_video:  # a training has filmed its last agent already
+            record_game(args, fresh_policy(), run, step, stop)
+    elif run.iteration < args.num_iterations and os.path.exists(run.checkpoint):
+        why = "Stopped" if stop.number else "At --stop-at" if done else "Not saved"
+        stop_at = [] if done or args.stop_at is None else ["--stop-at", str(args.stop_at)]
+        print_message(f"{why}; continue with: {call_command(args, '--resume', run.path, *stop_at)}")
     sys.exit(128 + stop.number if cut_short else 1 if run.write_errors else 0)

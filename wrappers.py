@@ -262,7 +262,7 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
 
 
 def canonical_name(env_id: str) -> str:
-    """Returns a game's name as ale-py spells it (`pong`, `PONG` and `Pong-v5`'s kin are `Pong`); other ids stay."""
+    """Returns a game's name as ale-py spells it (`pong` and `PongNoFrameskip-v4` are `Pong`); other ids stay."""
     rom, repeat_action_probability = find_atari_game(env_id) or ("", None)
     return atari_specs()[rom.replace("_", "")].name if repeat_action_probability == 0 else env_id
 

@@ -14,6 +14,7 @@ evaluated, updates the run that it became. One with the thesis's schedule is rea
 import gzip
 import json
 import re
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -94,7 +95,7 @@ def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
         "hours": {"wall": round(wall, 3), "core": round(wall * args["threads"], 3)},
         "evaluation": read_evaluation(directory / "eval.csv"),
         # Without the directory that it was logged to: a path of one machine, which tells nothing of the run
-        "command": re.sub(r" --log-dir ('[^']*'|\S+)", "", about["command"]),
+        "command": shlex.join(word for word in shlex.split(about["command"]) if not word.startswith("--log-dir=")),
         "arguments": {name: value for name, value in args.items() if name != "log_dir"},
         "versions": provenance,
     }, curve

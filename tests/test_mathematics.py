@@ -67,12 +67,6 @@ def test_gae_is_the_same_for_whole_number_rewards_of_any_dtype(each_script):
     assert torch.equal(*both) and both[0].abs().min() > 0.01
 
 
-@pytest.mark.thesis("Agent")
-def test_a_network_says_which_observations_it_takes(each_script):
-    with pytest.raises(ValueError, match=r"\(4, 64, 64\); give \(channels, 84, 84\) or \(size,\)"):
-        each_script.Agent((4, 64, 64), 6)
-
-
 def test_the_clip_range_of_ppo_is_epsilon_whatever_the_advantage():
     assert ppo_atari.clip_range(torch.tensor([-3.0, 0.0, 2.0]), 0.1).tolist() == pytest.approx([0.1] * 3)
 

@@ -292,8 +292,8 @@ def test_evaluations_and_films_play_other_games_than_the_training(script, tmp_pa
         lambda policy, envs, num_games, seed, stop: seeds.append(seed) or envs.reset() and [(1.0, 1)],
     )
     with open_run(script, tmp_path) as run:
-        bookkeeping.evaluate(args, policy, run, step=0)
-        record_game(args, policy, run, step=0)
+        bookkeeping.evaluate(args, policy, run, 0, bookkeeping.StopSignal())
+        record_game(args, policy, run, 0, bookkeeping.StopSignal())
         assert len(seeds) == 2 and not run.write_errors
     numbers = [number for seed in (args.seed, *seeds) for number in env_seeds(seed, 8)]
     assert len(set(numbers)) == 3 * 8

@@ -35,7 +35,7 @@ def make_training(out, variant="ppo", game="CartPole-v1", seed=1, started=1, **c
     log(directory, {collect.TAGS[column]: dict(enumerate(values, start=1)) for column, values in columns.items()})
     provenance = {"commit": "abc", "python": "3.12", "torch": "2.13.0", "machine": "a machine", "threads": 1}
     arguments = {**make_arguments(variant, game, seed), "log_dir": "a b"}
-    record = {"command": "ppo_atari.py --log-dir 'a b'", "args": arguments, "provenance": provenance}
+    record = {"command": "ppo_atari.py '--log-dir=a b'", "args": arguments, "provenance": provenance}
     (directory / "args.json").write_text(json.dumps(record))
     return directory
 
@@ -92,6 +92,11 @@ def contents(directory) -> dict[str, bytes]:
 def cells(markdown: str) -> list[list[str]]:
     lines = [line for line in markdown.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+@pytest.fixture(autouse=True)
+def event_files_in_order():
+    """These tests name their files themselves."""
 
 
 def test_all_points_of_a_curve_are_read(tmp_path):

@@ -51,7 +51,7 @@ class Args:
 
 
 def collect(out: Path, directories: Sequence[Path] = (), note: str = "") -> list[Path]:
-    """Brings OUT/runs up to date with training directories; returns what it wrote, nothing where another run is."""
+    """Brings OUT/runs up to date with all of the training directories, or with none if another run is in the way."""
     if not re.fullmatch(r"[\w.-]*", note):
         usage_error(f"--note {note}", "give letters, digits, '.', '_' and '-'")
     records = read_records(out)

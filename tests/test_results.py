@@ -172,13 +172,14 @@ def test_a_new_run_adds_files_and_an_older_one_is_updated(tmp_path):
 
 def test_another_run_with_the_same_key_needs_a_note(tmp_path, monkeypatch, capfd):
     collect.collect(tmp_path, [make_training(tmp_path, started=1, kl=[1])])
-    other, third = make_training(tmp_path, started=2, kl=[2]), make_training(tmp_path, seed=3, kl=[3])
+    other = make_training(tmp_path, started=2, kl=[2])
+    third, fourth = (make_training(tmp_path, seed=3, started=started, kl=[3]) for started in (1, 2))
     before = contents(tmp_path)
-    for directories in ([third, other], []):  # all of OUT/training
+    for directories, refused in (([third, other], other), ([third, fourth], fourth), ([], other)):  # []: OUT/training
         with pytest.raises(SystemExit) as ended:
             call(monkeypatch, collect, *directories, "--out", tmp_path)
         err = capfd.readouterr().err
-        assert ended.value.code == 2 and err.count("\n") == 1 and "give --note" in err and str(other) in err
+        assert ended.value.code == 2 and err.count("\n") == 1 and "give --note" in err and str(refused) in err
         assert contents(tmp_path) == before
     call(monkeypatch, collect, other, "--out", tmp_path, "--note", "again")
     assert [run.kl.tolist() for run in collect.read_runs(tmp_path, "again")[1].values()] == [[2]]
@@ -400,11 +401,11 @@ def test_a_call_writes_its_set_and_equal_input_gives_equal_bytes(tmp_path, monke
         make_training(out, variant, started=2, mean_return_100=[1, 2], kl=[0.1, 0.2])
         make_training(tmp_path / "other", variant, mean_return_100=[1, 2], kl=[0.1, 0.2])
     call(monkeypatch, report, "--out", out, "--note", "spo", "--challenger", "mine")
-    call(monkeypatch, report, "--out", tmp_path / "other", "--challenger", "mine")
+    call(monkeypatch, report, "--out", tmp_path / "other")
     after = contents(tmp_path)
     assert made.items() <= after.items()
     assert "](figures/spo-unfinished/kl.png)" in after["results/spo.md"].decode()
-    assert "mine's final score is above PPO's" in after["other/README.md"].decode()
+    assert "| CartPole-v1 | mine |" in after["other/README.md"].decode()
 
 
 @pytest.mark.parametrize(

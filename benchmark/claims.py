@@ -14,7 +14,7 @@ the claim's sign:
                      seeds), baseline - challenger
     own spikes       share of iterations with a KL above ten times the run's own median, baseline - challenger
     clip ratio       0.02 - |mean of `losses/avg_clip_ratio` - the baseline's ε|, so for PPO's 0.1 above 0 from 0.08 to
-                     0.12; of the challenger's runs alone
+                     0.12; only of the challenger's runs
 On one game a claim holds if every margin is above 0, and does not hold if every margin is below 0; else the two cannot
 be told apart with these runs. Across games the same is asked of both ends of the 95 % interval of the interquartile
 mean of all margins. With fewer than three pairs, on the game or on any of the games, the two cannot be told apart at

@@ -91,7 +91,7 @@ def draw_panel(axis: Axes, curves: Curves, game: str, column: str, frames: int) 
         axis.set_yscale("symlog", linthresh=10.0 ** round(math.log10(median)) if median > 0 else 1)
     elif column == "kl":
         axis.set_yscale("log")
-        axis.yaxis.set_minor_formatter(NullFormatter())  # names powers of ten alone
+        axis.yaxis.set_minor_formatter(NullFormatter())  # only powers of ten have a number
 
 
 def colour(curves: Curves, variant: str) -> str:

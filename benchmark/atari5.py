@@ -35,8 +35,7 @@ from wrappers import canonical_name
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# A script of this project and its flags. On the command line: NAME=SCRIPT FLAGS
-VARIANTS = {
+VARIANTS = {  # a script of this project and its flags
     "ppo": "ppo_atari.py --clip-coef 0.1",  # the thesis's two, chapter 4
     "acppo": "acppo_atari.py --clip-coef 0.16 --c 1.0",
     "ppo-matched": "ppo_atari.py --clip-coef 0.084",  # adaptation or smaller steps? Its KL on Qbert is AC-PPO's
@@ -190,9 +189,9 @@ def train(run: Run) -> str:
     signal.signal(signal.SIGINT, signal.default_int_handler)
     if directory := run.directory():
         with filelock.FileLock(directory / "run.lock", timeout=LOCK_SECONDS):
-            pass  # no other process has it
+            pass
     # In a session that Ctrl-C in the terminal does not reach: the script would take the SIGTERM for a second signal
-    prctl = getattr(ctypes.CDLL(None), "prctl", None)  # Linux has it; 1 is PR_SET_PDEATHSIG, for a worker that is killed
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)  # Linux has it; 1: PR_SET_PDEATHSIG, if a worker is killed
     options = {"start_new_session": True, "preexec_fn": prctl and (lambda: prctl(1, signal.SIGTERM))}
     for _ in range(2):
         if Path(run.variant.script).read_bytes() != run.variant.text:

@@ -1,136 +1,104 @@
 """Finds the bound at which one variant clips as many samples, or moves the policy as far, as another.
 
-    python benchmark/match.py --on clipfrac --games Phoenix Qbert
     python benchmark/match.py --on kl --games Qbert --iterations 200
 
 `--on clipfrac` finds the δ of the variant `product`. The thesis's product-only objective (section 3.1) bounds
-abs((ρ - 1)Â) by δ alone, and the thesis gives no δ; held against PPO it is fair if both clip the same share of samples.
-`--on kl` finds the ε of the variant `ppo-matched`: PPO whose KL between policy updates is AC-PPO's, so that the two
-differ by the adaptation and not by smaller steps.
+abs((ρ - 1)Â) by δ and nothing else, and the thesis gives no δ; a comparison with PPO is fair if both clip the same
+share of samples. `--on kl` finds the ε of the variant `ppo-matched`: PPO whose KL between policy updates is AC-PPO's,
+so that the two differ by the adaptation and not by smaller steps.
 
-The one that is matched and the other at each of `--bounds` are trained for the first iterations of the full schedule,
-`losses/clipfrac` or `losses/kl` is averaged over them, and the bound is where the mean, linear in the bound's log
-between the tried ones, is the matched one's. The answer holds for these iterations. Prints a table; 50 iterations
-take four minutes a run at 210 steps/s. Exit status: 0 all games have a match, 1 some have none, 2 bad input.
+The matched variant, and the other at each of `--bounds`, are trained for the first iterations of the full schedule.
+The match is where the mean of the curve, linear in the bound's log, is the matched variant's, for these iterations.
 """
 
 import itertools
-import math
 import subprocess
 import sys
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
+import tyro
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from benchmark.collect import ROOT, read_curve, read_events
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
 from benchmark.readme import markdown
-from bookkeeping import available_cores, parse, refuse, say, tell
+from bookkeeping import NonNegativeInt, PositiveInt, available_cores, check_bounds
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
-@dataclass
-class Search:
-    matched: tuple[str, ...]  # script and flags
-    tried: tuple[str, ...]  # the same; its `--clip-coef` is looked for
-    symbol: str
-    bounds: tuple[float, ...]
-    rises: bool  # with the bound
-
-
-# By the column of curves.csv whose mean is to be equal
+# The matched variant; the tried one, whose --clip-coef is looked for; its symbol; bounds; does the mean rise with them?
 SEARCHES = {
-    "clipfrac": Search(("ppo_atari.py",), ("acppo_atari.py", "--c", "inf"), "δ", (0.01, 0.02, 0.04, 0.08), False),
-    "kl": Search(("acppo_atari.py",), ("ppo_atari.py",), "ε", (0.04, 0.06, 0.08), True),
+    "clipfrac": (("ppo_atari.py",), ("acppo_atari.py", "--c", "inf"), "δ", (0.01, 0.02, 0.04, 0.08), False),
+    "kl": (("acppo_atari.py",), ("ppo_atari.py",), "ε", (0.04, 0.06, 0.08), True),
 }
 
 
 @dataclass
 class Args:
-    on: str
-    """the curve whose mean is to be equal: clipfrac or kl"""
+    on: Literal["clipfrac", "kl"]
+    """the curve whose mean is to be equal"""
     games: tuple[str, ...] = ("Qbert",)
     """games, named as for the scripts"""
     bounds: tuple[float, ...] = ()
     """bounds to try, above 0, two or more; by default 0.01 to 0.08 for clipfrac, 0.04 to 0.08 for kl"""
-    seed: int = 1
+    seed: NonNegativeInt = 1
     """seed of every run"""
-    iterations: int = 50
+    iterations: PositiveInt = 50
     """rollouts of 1,024 agent steps with their updates"""
     bf16: bool = False
     """train in bfloat16, as the runs that are compared"""
-    jobs: int = available_cores()
+    jobs: PositiveInt = available_cores()
     """runs at once, each with one thread"""
 
+    def rules(self) -> list[tuple[str, bool, str]]:
+        """Returns (argument, does it hold, advice) for the rule that its type does not say."""
+        return [("bounds", not self.bounds or len(set(self.bounds)) > 1, "give two or more")]
 
-def mean_over_training(column: str, script: str, *flags: str, steps: int) -> float:
-    """Trains in a process of its own, with one thread, and returns the mean of a column of curves.csv.
 
-    Raises ChildProcessError with the last line that the script has said if it ends with another status than 0.
-    """
+def mean_over_training(on: str, script: str, *flags: str) -> float:
+    """Trains in another process, and returns the mean of the curve `losses/ON`. Raises CalledProcessError."""
     with tempfile.TemporaryDirectory() as directory:
-        command = [sys.executable, str(ROOT / script), *flags, "--stop-at", str(steps), "--threads", "1"]
-        command += ["--eval-episodes", "0", "--log-dir", directory]
-        run = subprocess.run(command, stderr=subprocess.PIPE, text=True, encoding="utf-8", errors="replace")
-        if run.returncode:
-            raise ChildProcessError((run.stderr.strip().splitlines() or [f"exit status {run.returncode}"])[-1])
-        (run_dir,) = Path(directory).iterdir()
-        return float(read_curve(read_events(run_dir))[column].mean())
+        common = ["--threads", "1", "--eval-episodes", "0", "--log-dir", directory]
+        subprocess.run([sys.executable, str(ROOT / script), *flags, *common], check=True)
+        (file,) = Path(directory).glob("*/events.out.tfevents*")
+        reader = EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload()  # 0: every point
+        return float(np.mean([event.value for event in reader.Scalars(f"losses/{on}")]))
 
 
 def interpolate(bounds: list[float], means: list[float], wanted: float, rises: bool) -> float:
     """Returns the bound at which the mean is `wanted`; NaN if that is beyond the tried ones, or if the means do not
-    rise (or fall) with the bound, so that noise is larger than the effect."""
-    bounds, means = map(np.array, zip(*sorted(zip(bounds, means))))
-    sign = 1 if rises else -1
+    rise (or fall) with the bounds, which are sorted: noise is larger than the effect then."""
+    sign, means = (1 if rises else -1), np.array(means)
     if (np.diff(sign * means) <= 0).any():
-        return math.nan
+        return np.nan
     return float(np.exp(np.interp(sign * wanted, sign * means, np.log(bounds), left=np.nan, right=np.nan)))
 
 
 def main() -> None:
-    args = parse(Args, description=__doc__)
-    if args.on not in SEARCHES:
-        refuse(f"--on {args.on}", f"give {' or '.join(SEARCHES)}")
-    search = SEARCHES[args.on]
-    bounds = args.bounds or search.bounds
-    rules = [
-        ("games", bool(args.games), "give at least one"),
-        ("bounds", len(set(bounds)) > 1 and all(0 < bound < 1e30 for bound in bounds), "give two or more above 0"),
-        ("iterations", args.iterations > 0, "give a whole number above 0"),
-        ("jobs", args.jobs > 0, "give a whole number above 0"),
-    ]
-    for name, works, advice in rules:
-        if not works:
-            refuse(f"--{name} {getattr(args, name)}", advice)
-    contenders = [search.matched, *((*search.tried, "--clip-coef", str(bound)) for bound in bounds)]
-    common = ("--seed", str(args.seed), *(["--bf16"] if args.bf16 else []))
-    steps, pairs = 1024 * args.iterations, list(itertools.product(args.games, contenders))
-    with ThreadPoolExecutor(args.jobs) as pool:
-        runs = [
-            pool.submit(mean_over_training, args.on, *contender, "--env-id", game, *common, steps=steps)
-            for game, contender in pairs
-        ]
-        try:
-            means = {pair: run.result() for pair, run in zip(pairs, runs)}
-        except ChildProcessError as error:
-            pool.shutdown(cancel_futures=True)
-            say(str(error))
-            sys.exit(2)
+    args = tyro.cli(Args, description=__doc__)
+    check_bounds(args)
+    matched, tried, symbol, bounds, rises = SEARCHES[args.on]
+    bounds = sorted(args.bounds or bounds)
+    variants = [matched, *((*tried, "--clip-coef", str(bound)) for bound in bounds)]
+    common = ["--seed", str(args.seed), "--stop-at", str(1024 * args.iterations), *(["--bf16"] if args.bf16 else [])]
     table, found = [], {}
+    train = lambda pair: mean_over_training(args.on, *pair[1], "--env-id", pair[0], *common)  # noqa: E731
+    with ThreadPoolExecutor(args.jobs) as pool:
+        means = iter(list(pool.map(train, itertools.product(args.games, variants))))
     for game in args.games:
-        wanted, *tried = (means[game, contender] for contender in contenders)
-        found[game] = interpolate(list(bounds), tried, wanted, search.rises)
-        table.append([game, *(f"{mean:.3g}" for mean in (wanted, *tried)), f"{found[game]:.4f}"])
-    names = [f"{search.symbol} = {bound:g}" for bound in bounds]
-    tell(markdown(["game", " ".join(search.matched), *names, f"matching {search.symbol}"], table))
-    if without := [game for game, bound in found.items() if math.isnan(bound)]:
-        advice = f"the {args.on} to match is not between those of the tried bounds; give other --bounds, or more "
-        say(f"{', '.join(without)}: {advice}--iterations")
-        sys.exit(1)
-    tell(f"Geometric mean over the games: {search.symbol} = {np.exp(np.mean(np.log(list(found.values())))):.4f}")
+        wanted, *of_bounds = itertools.islice(means, len(variants))
+        found[game] = interpolate(bounds, of_bounds, wanted, rises)
+        table.append([game, *(f"{mean:.3g}" for mean in (wanted, *of_bounds)), f"{found[game]:.4f}"])
+    names = [f"{symbol} = {bound:g}" for bound in bounds]
+    print(markdown(["game", " ".join(matched), *names, f"matching {symbol}"], table))
+    if without := [game for game, bound in found.items() if np.isnan(bound)]:
+        sys.exit(f"{', '.join(without)}: no match between the tried bounds; give other --bounds, or more --iterations")
+    print(f"Geometric mean over the games: {symbol} = {np.exp(np.mean(np.log(list(found.values())))):.4f}")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What each speed trick of the scripts gains on this machine, alone: its plain form and the trick in turn, A B A B.
+"""What each speed trick of the scripts gains on this machine: its plain form and the trick in turn, A B A B.
 
     python benchmark/tricks.py --threads 2
 
@@ -15,14 +15,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from statistics import median, quantiles
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
-from bookkeeping import kind_of_processor, parse, tell, tune_process
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
+from bookkeeping import processor_kind, tune_process
 
 if __name__ == "__main__":
     tune_process()  # as the scripts do, before torch is imported
 
 import numpy as np
 import torch
+import tyro
 from ale_py.vector_env import AtariVectorEnv
 from torch import nn
 from torch.distributions import Categorical
@@ -49,20 +50,12 @@ def nature_cnn(convolve_last: bool = False, inplace: bool = True) -> nn.Sequenti
     return nn.Sequential(*layers, *wide, nn.ReLU(inplace), nn.Linear(512, NUM_ACTIONS + 1))
 
 
-def update(network: nn.Module, screens: torch.Tensor) -> Callable:
-    def run():
-        network.zero_grad()
-        network(screens.float().div_(255.0)).square().mean().backward()
-
-    return run
-
-
-def update_bf16(network: nn.Module, screens: torch.Tensor, dtype: torch.dtype) -> Callable:
-    """Returns an update under `--bf16`, with screens that are divided in `dtype`."""
+def update(network: nn.Module, screens: torch.Tensor, dtype: torch.dtype = torch.float32, bf16=False) -> Callable:
+    """Returns an update, with screens that are divided in `dtype`."""
 
     def run():
         network.zero_grad()
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=bf16):
             output = network(screens.to(dtype).div_(255.0)).float()
         output.square().mean().backward()
 
@@ -100,21 +93,12 @@ def late_optimizer_step(flush: bool) -> Callable:
     return lambda: thread.submit(run).result()
 
 
-def forward(network: nn.Module, screens: torch.Tensor, mode: Callable) -> Callable:
+def forward(network: nn.Module, screens: torch.Tensor, mode=torch.inference_mode, bf16=False) -> Callable:
+    """Returns a step of the network; one that is in bfloat16 already is not cast."""
+
     def run():
-        with mode():
-            network(screens.float().div_(255.0))
-
-    return run
-
-
-def forward_bf16(network: nn.Module, screens: torch.Tensor) -> Callable:
-    """Returns a step of the network under `--bf16`; a network that is in bfloat16 already is not cast."""
-
-    @torch.inference_mode()
-    def run():
-        with torch.autocast("cpu", torch.bfloat16):
-            network(screens.to(torch.bfloat16).div_(255.0))
+        with mode(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
+            network(screens.to(torch.bfloat16 if bf16 else torch.float32).div_(255.0))
 
     return run
 
@@ -152,7 +136,7 @@ def tricks(threads: int) -> dict[str, tuple[Callable, Callable]]:
     channels_last = nature_cnn().to(memory_format=torch.channels_last)
     convolved = nature_cnn(convolve_last=True).to(memory_format=torch.channels_last)
     out_of_place = nature_cnn(inplace=False).to(memory_format=torch.channels_last)
-    logits = torch.randn(NUM_ENVS, NUM_ACTIONS)
+    few, logits, rollout = last[:NUM_ENVS], torch.randn(NUM_ENVS, NUM_ACTIONS), rollout_step(threads)
     return {
         "update: channels-last layout": (update(nature_cnn(), first), update(channels_last, last)),
         "update: 512-unit layer as a 7×7 convolution (refused)": (update(channels_last, last), update(convolved, last)),
@@ -162,48 +146,22 @@ def tricks(threads: int) -> dict[str, tuple[Callable, Callable]]:
         "minibatch: index_select for obs[indices]": (lambda: nhwc[chosen], lambda: nhwc.index_select(0, chosen)),
         "minibatch: .float().div_(255) for / 255": (lambda: last / 255.0, lambda: last.float().div_(255.0)),
         "update, bfloat16: screens cast to it at once, not by way of float32": (
-            update_bf16(channels_last, last, torch.float32),
-            update_bf16(channels_last, last, torch.bfloat16),
+            update(channels_last, last, torch.float32, bf16=True),
+            update(channels_last, last, torch.bfloat16, bf16=True),
         ),
-        "rollout: inference_mode for no_grad": (
-            forward(channels_last, last[:NUM_ENVS], torch.no_grad),
-            forward(channels_last, last[:NUM_ENVS], torch.inference_mode),
-        ),
+        "rollout: inference_mode": (forward(channels_last, few, torch.no_grad), forward(channels_last, few)),
         "rollout, bfloat16: weights cast once, not at each step": (
-            forward_bf16(channels_last, last[:NUM_ENVS]),
-            forward_bf16(copy.deepcopy(channels_last).bfloat16(), last[:NUM_ENVS]),
+            forward(channels_last, few, bf16=True),
+            forward(copy.deepcopy(channels_last).bfloat16(), few, bf16=True),
         ),
         "rollout: multinomial for Categorical": (
             lambda: Categorical(logits=logits).sample(),
             lambda: torch.multinomial(logits.log_softmax(-1).exp(), 1).squeeze(-1),
         ),
-        "rollout: half the games run while the network serves the others (refused)": (
-            rollout_step(threads),
-            rollout_step(threads, groups=2),
-        ),
-        "rollout: twice as many threads for the games (refused)": (rollout_step(threads), rollout_step(2 * threads)),
-        "rollout: the games' threads bound to a core each (refused)": (
-            rollout_step(threads),
-            rollout_step(threads, thread_affinity_offset=0),
-        ),
+        "rollout: half the games run while the others act (refused)": (rollout, rollout_step(threads, groups=2)),
+        "rollout: twice as many threads for the games (refused)": (rollout, rollout_step(2 * threads)),
+        "rollout: games' threads bound to cores (refused)": (rollout, rollout_step(threads, thread_affinity_offset=0)),
     }
-
-
-def main() -> None:
-    args = parse(Args, description=__doc__)
-    torch.set_num_threads(args.threads)
-    setting = f"{kind_of_processor()}, {args.threads} threads, {args.rounds} rounds"
-    tell(f"torch {torch.__version__}, {setting}\n")
-    tell("| trick | plain, ms | trick, ms | plain / trick (quartiles) |\n|-|-|-|-|")
-    for name, pair in tricks(args.threads).items():
-        measured = []
-        for _ in range(args.rounds + 1):
-            measured.append([time_of(form, args.seconds) for form in pair])
-        plain, trick = zip(*measured[1:])  # the first round warms up
-        ratios = [a / b for a, b in zip(plain, trick)]
-        low, _, high = quantiles(ratios, n=4)
-        times = f"{1e3 * median(plain):.3g} | {1e3 * median(trick):.3g}"
-        tell(f"| {name} | {times} | {median(ratios):.2f} ({low:.2f} to {high:.2f}) |")
 
 
 def time_of(form: Callable, seconds: float) -> float:
@@ -213,6 +171,19 @@ def time_of(form: Callable, seconds: float) -> float:
         form()
         calls += 1
     return (time.perf_counter() - start) / calls
+
+
+def main() -> None:
+    args = tyro.cli(Args, description=__doc__)
+    torch.set_num_threads(args.threads)
+    print(f"torch {torch.__version__}, {processor_kind()}, {args.threads} threads, {args.rounds} rounds\n")
+    print("| trick | plain, ms | trick, ms | plain / trick (quartiles) |\n|-|-|-|-|")
+    for name, pair in tricks(args.threads).items():
+        measured = [[time_of(form, args.seconds) for form in pair] for _ in range(args.rounds + 1)]
+        plain, trick = zip(*measured[1:])  # the first round warms up
+        low, middle, high = quantiles([a / b for a, b in zip(plain, trick)], n=4)
+        times = f"{1e3 * median(plain):.3g} | {1e3 * median(trick):.3g}"
+        print(f"| {name} | {times} | {middle:.2f} ({low:.2f} to {high:.2f}) |")
 
 
 if __name__ == "__main__":

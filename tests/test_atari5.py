@@ -101,28 +101,18 @@ def interrupt(driver: subprocess.Popen) -> tuple[int, str]:
     return driver.returncode, said
 
 
-def parent(pid: int) -> int:
-    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1])
-
-
-def processes(out: Path) -> dict[str, list[int]]:
-    """Returns the processes that train, by the name of their run."""
-    found, parents = {}, {}
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            words = (process / "cmdline").read_bytes().decode().split("\0")
-            parents[int(process.name)] = parent(int(process.name))
-        except OSError:  # it has just ended
-            continue
-        flags = dict(zip(words, words[1:]))
-        if flags.get("--resume", "").startswith(str(out)):
-            found[int(process.name)] = Path(flags["--resume"]).name.rpartition("__")[0]
-        elif flags.get("--log-dir") == str(out / "training"):
-            found[int(process.name)] = f"{flags['--env-id']}__{flags['--exp-name']}__{flags['--seed']}"
+def processes(out: Path) -> dict[str, list[tuple[int, int]]]:
+    """Returns (id, parent's id) of the processes that train, by the name of their run."""
+    shown = subprocess.run(["ps", "-ewwo", "pid=,ppid=,args="], capture_output=True, text=True).stdout
+    found = {}
+    for pid, parent, variant in re.findall(
+        rf"^ *(\d+) +(\d+) .*/(\w+)_atari\.py .*{out}/training", shown, re.MULTILINE
+    ):
+        found[int(pid)] = int(parent), f"CartPole-v1__{variant}__1"
     by_name = defaultdict(list)
-    for pid, name in found.items():
-        if parents[pid] not in found:  # else it is about to become another program, such as git
-            by_name[name].append(pid)
+    for pid, (parent, name) in found.items():
+        if parent not in found:  # else it is about to become another program, such as git
+            by_name[name].append((pid, parent))
     return by_name
 
 
@@ -247,7 +237,7 @@ def test_run_of_a_killed_worker_is_resumed_where_it_was(tmp_path, start):
     driver, name = start(tmp_path, "--games", "CartPole-v1"), "CartPole-v1__ppo__1"
     wait_for(lambda: both_log(tmp_path))
     reached = steps(run_dirs(tmp_path)[name])[-1]
-    os.kill(parent(processes(tmp_path)[name][0]), signal.SIGKILL)
+    os.kill(processes(tmp_path)[name][0][1], signal.SIGKILL)
     run_dir = wait_for_second_start(tmp_path, name)
     status, said = interrupt(driver)
     _, second = sorted(run_dir.glob("events.*"), key=os.path.getmtime)
@@ -373,15 +363,10 @@ def test_run_that_another_process_holds_is_left_to_it(tmp_path, monkeypatch):
         atari5.train(run)
 
 
-def test_directory_without_a_checkpoint_does_not_count(tmp_path):
-    (tmp_path / "training" / "Qbert__ppo__1__1700000000").mkdir(parents=True)
-    run = make_run("ppo", tmp_path)
-    assert run.state == "unfinished" and "--resume" not in run.command()
-
-
-def test_newest_of_two_directories_is_resumed(tmp_path):
+def test_newest_directory_with_a_checkpoint_is_resumed(tmp_path):
     older = saved_run(tmp_path, 1024).directory()
     newer = older.rename(older.with_name("Qbert__ppo__1__1700000100"))
+    newer.with_name("Qbert__ppo__1__1700000200").mkdir()
     assert saved_run(tmp_path, 2048).directory() == newer
 
 
@@ -492,24 +477,23 @@ def test_script_edited_while_the_grid_runs_starts_no_run(my_ppo, tmp_path, monke
 
 @pytest.mark.parametrize(
     ("variants", "pair"),
-    [
-        (["mine=my_ppo.py", "ppo", "product"], ["--baseline", "mine", "--challenger", "ppo"]),
-        (["mine=my_ppo.py", "acppo", "ppo"], []),  # report.py's default is ppo and acppo
-        (["mine=my_ppo.py"], []),
-    ],
+    [("mine ppo product", ["mine", "ppo"]), ("mine acppo ppo", ["ppo", "acppo"]), ("mine", [])],
 )
 def test_report_compares_ppo_and_acppo_or_the_first_two(variants, pair, my_ppo, tmp_path, call, monkeypatch):
     called, make = [], atari5.make_run
     record = lambda words: called.append(words) or subprocess.CompletedProcess(words, 0)  # noqa: E731
     monkeypatch.setattr(subprocess, "run", record)
     monkeypatch.setattr(atari5, "make_run", lambda *words: dataclasses.replace(make(*words), state="done"))
-    assert call("--out", "out", "--games", "Qbert", "--variants", *variants)[0] == 0
-    assert called == [[sys.executable, str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out"), *pair]]
+    words = variants.replace("mine", "mine=my_ppo.py").split()
+    assert call("--out", "out", "--games", "Qbert", "--variants", *words)[0] == 0
+    compared = [] if pair in ([], ["ppo", "acppo"]) else ["--baseline", pair[0], "--challenger", pair[1]]  # its default
+    report = [sys.executable, str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out")]
+    assert called == [report + compared]
 
 
 def test_report_is_not_made_while_a_run_has_failed(tmp_path, call, monkeypatch):
     saved_run(tmp_path, 9216, "ppo", gamma=0.9)
     monkeypatch.setattr(subprocess, "run", lambda *_: pytest.fail("a report was made"))
-    flags = ("--games", "Qbert", "--seeds", "1", "--total-timesteps", "10000", "--out", str(tmp_path))
-    status, _, said = call(*flags, "--variants", "ppo")
+    flags = ("--games", "Qbert", "--seeds", "1", "--total-timesteps", "10000", "--variants", "ppo")
+    status, _, said = call(*flags, "--out", str(tmp_path))
     assert status == 1 and "gamma 0.9, not with 0.99" in said and "0 of 1 runs are done" in said

@@ -26,7 +26,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from multiprocessing import get_context
@@ -110,7 +109,7 @@ class Candidate:
 
 def make_candidates(args: Args) -> list[Candidate]:
     """Returns what the command line names, the scripts first. Ends the program with status 2 if one cannot run."""
-    torch, candidates = importlib.metadata.version("torch"), []
+    version, candidates = importlib.metadata.version("torch"), []
     for i, given in enumerate(args.candidates):
         script, *flags = shlex.split(given)
         if not Path(script).is_file():
@@ -120,35 +119,31 @@ def make_candidates(args: Args) -> list[Candidate]:
         name = f"{given} ({args.candidates[:i].count(given) + 1})" if given in args.candidates[:i] else given
         script = os.path.abspath(script)
         command = [sys.executable, script, *flags, "--env-id", args.env_id, "--eval-episodes", "0"]
-        candidates.append(Candidate(name, command, git_commit(script, os.path.dirname(script)), torch))
+        candidates.append(Candidate(name, command, git_commit(script, os.path.dirname(script)), version))
         if "--resume" in flags:
-            candidates[-1].checkpoint = Path(command[command.index("--resume") + 1]) / "checkpoint.pt"
-            candidates[-1].first_step = call_in_process(read_step, candidates[-1].checkpoint)
+            import torch
+
+            checkpoint = candidates[-1].checkpoint = Path(command[command.index("--resume") + 1]) / "checkpoint.pt"
+            candidates[-1].first_step = torch.load(checkpoint, weights_only=True)["global_step"]
     if args.peer:
-        version, script = importlib.metadata.version("stable-baselines3"), str(Path(__file__).with_name("sb3_ppo.py"))
+        name = f"Stable-Baselines3 {importlib.metadata.version('stable-baselines3')}"
+        script = str(Path(__file__).with_name("sb3_ppo.py"))
         command = [sys.executable, script, "--env-id", f"{canonical_name(args.env_id)}NoFrameskip-v4"]
-        candidates.append(Candidate(f"Stable-Baselines3 {version}", command, git_commit(script), torch, peer=True))
+        candidates.append(Candidate(name, command, git_commit(script), version, peer=True))
     if args.cleanrl:
         checkout, python = str(args.cleanrl.resolve()), args.cleanrl_python
         ask = [python, "-c", "import importlib.metadata; print(importlib.metadata.version('torch'))"]
-        torch = subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip()
+        version = subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip()
         # The prefix has Gymnasium import ale-py: under 0.29 the versions that ship ROMs do not register by themselves
         game = f"ale_py:{canonical_name(args.env_id)}NoFrameskip-v4"
         command = [os.path.abspath(shutil.which(python)), f"{checkout}/{CLEANRL}", "--env-id", game, "--no-cuda"]
         commit, variables = git_commit(command[1], checkout), {"PYTHONPATH": checkout}
-        candidates.append(Candidate("CleanRL", command, commit, torch, peer=True, variables=variables))
+        candidates.append(Candidate("CleanRL", command, commit, version, peer=True, variables=variables))
     return candidates
 
 
-def read_step(checkpoint: Path) -> int:
-    """Returns the agent steps of a run up to its checkpoint."""
-    import torch
-
-    return torch.load(checkpoint, weights_only=True)["global_step"]
-
-
 # ------------------------------------------------------------------------------------------ limits of the processor
-def call_in_process(function: Callable, *arguments):
+def call_in_process(function, *arguments):
     """Calls a function in a new process: it may set torch's threads, and its memory does not count as this one's."""
     with get_context("spawn").Pool(1) as pool:
         return pool.apply(function, arguments)
@@ -159,20 +154,17 @@ def probe_convolutions(threads: int, dtype_name: str, seconds: float = 2.0) -> f
     import torch
 
     torch.set_num_threads(threads)
-    layers = []
-    for inputs, outputs, kernel, stride, size in ((4, 32, 8, 4, 84), (32, 64, 4, 2, 20), (64, 64, 3, 1, 9)):
-        layout = {"dtype": getattr(torch, dtype_name), "memory_format": torch.channels_last}
-        screens = torch.rand(256, inputs, size, size).to(**layout).requires_grad_(inputs > 4)
-        layers.append((torch.nn.Conv2d(inputs, outputs, kernel, stride).to(**layout), screens))
+    layout = {"dtype": getattr(torch, dtype_name), "memory_format": torch.channels_last}
+    layers = [torch.nn.Conv2d(*sizes).to(**layout) for sizes in ((4, 32, 8, 4), (32, 64, 4, 2), (64, 64, 3, 1))]
+    network, screens = torch.nn.Sequential(*layers), torch.rand(256, 4, 84, 84).to(**layout)
+    forward = FORWARD - 2 * 3136 * 512 / 1e6
     best, stop = 0.0, time.perf_counter() + seconds
-    for convolution, screens in itertools.cycle(layers):  # emulated bfloat16 takes a second for one of them
-        if (start := time.perf_counter()) > stop and best:
-            return best
-        output = convolution(screens)
+    while not best or time.perf_counter() < stop:
+        start = time.perf_counter()
+        output = network(screens)
         output.backward(output.detach())
-        elapsed = time.perf_counter() - start
-        flop = 2 * output.numel() * convolution.weight[0].numel() * (3 if screens.requires_grad else 2)
-        best = max(best, flop / elapsed / 1e9)
+        best = max(best, len(screens) * (3 * forward - FIRST_LAYER) / 1e3 / (time.perf_counter() - start))
+    return best
 
 
 def probe_emulator(rom: str, num_envs: int, threads: int, block: int = 100) -> float:
@@ -221,11 +213,12 @@ def run_process(setting: dict, iterations: int, directory: Path) -> tuple[pd.Dat
     threads = str(max(1, threads // jobs))
     if candidate.peer:  # it has no flag for threads, and logs below its working directory
         variables |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
-    else:
-        command += ["--threads", threads, "--log-dir", str(directory)]
-    if candidate.checkpoint:
+    elif candidate.checkpoint:
         shutil.copy(candidate.checkpoint, directory)
         command[command.index("--resume") + 1] = str(directory)
+    else:
+        command += ["--log-dir", str(directory)]
+    command += [] if candidate.peer else ["--threads", threads]
     started, cwd = time.time(), directory if candidate.peer else None
     child = subprocess.Popen(command, cwd=cwd, env=variables, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(child.pid, 0)
@@ -233,7 +226,7 @@ def run_process(setting: dict, iterations: int, directory: Path) -> tuple[pd.Dat
     if child.returncode != 0:
         sys.exit(f"{candidate.name} ended with status {child.returncode}")
     log = read_log(directory)
-    # Linux counts what this program holds, too: it imports no torch
+    # At least what this program holds, as Linux counts it: so the probes are other processes
     peak_mb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
     return log, {"peak_mb": peak_mb, "time/first_iteration": log["end"].iloc[0] - started}
 
@@ -331,9 +324,9 @@ def main() -> None:
         print(f"round {number}, {' / '.join(str(about[name]) for name in ROW)}: {speed:,.0f} steps/s", file=sys.stderr)
 
     tables = make_tables(pd.DataFrame(processes), [candidate.name for candidate in candidates if candidate.peer])
-    print(f"{args.env_id} on {cpu}, {call['kind']}, {available_cores()} cores, torch {candidates[0].torch},")
-    print(f"commit {candidates[0].commit}; {args.rounds} rounds of {args.window} iterations after {args.warmup};")
-    print("median (minimum to maximum).\n", *tables, sep="\n")
+    machine = f"{cpu}, {call['kind']}, {available_cores()} cores, torch {candidates[0].torch}, {candidates[0].commit}"
+    window = f"{args.rounds} rounds of {args.window} iterations after {args.warmup}"
+    print(f"{args.env_id} on {machine}; {window}; median (minimum to maximum).\n", *tables, sep="\n")
 
 
 if __name__ == "__main__":

@@ -6,14 +6,12 @@
     python benchmark/throughput.py ppo_atari.py "ppo_atari.py --resume runs/Breakout__ppo_atari__1__1700000000"
 
 A candidate is a script with its flags. Each run is a whole process without a GPU, and takes about a minute. Runs are
-interleaved, A B A B, and compared round by round: a machine whose speed drifts moves both sides of a ratio alike, and
-the same script given twice shows how much noise is left. With `--jobs 2` a candidate runs as two processes that share
-the threads, and their steps/s add up while both are past their warm-up. With `--resume` it runs from a copy of that
-checkpoint: the end of a training can be slower than its start.
+interleaved, A B A B, and compared round by round, because a machine's speed drifts; the same script given twice shows
+how much noise is left. With `--jobs 2` a candidate runs as two processes that share the threads, and their steps/s add
+up while both are past their warm-up. With `--resume` it runs from a copy of that checkpoint.
 
 Three tables are printed: speed; where an iteration's time goes; and how much of two limits is reached, the convolutions
-that the processor can compute and the steps that the bare emulator can make. The CSV gets a row for each process.
-`--peer` needs `pip install -e '.[peer]'`.
+that the processor can compute and the steps that the emulator can make. The CSV gets a row for each process.
 """
 
 import importlib.metadata
@@ -74,12 +72,11 @@ class Args:
     num_envs: tuple[int, ...] = (8,)
     """environments that a process plays at once"""
     peer: bool = False
-    """measure Stable-Baselines3's PPO too"""
+    """measure Stable-Baselines3's PPO too (`pip install -e '.[peer]'`)"""
     cleanrl: Path | None = None
     """measure cleanrl/ppo_atari.py of this checkout of CleanRL too"""
     cleanrl_python: str = sys.executable
-    """the interpreter for it: with torch, gymnasium 0.29.1, ale-py 0.10.1, numpy 1, opencv-python-headless 4,
-    tensorboard and tyro"""
+    """its interpreter: torch, gymnasium 0.29.1, ale-py 0.10.1, numpy 1, opencv-python-headless 4, tensorboard, tyro"""
     csv: Path = ROOT / "results" / "throughput.csv"
     """file that the rows are added to"""
 
@@ -271,27 +268,26 @@ def make_tables(processes: pd.DataFrame, peers: list[str]) -> list[str]:
     speed_table, phase_table, limits_table = [], [], []
     for row, own in processes.groupby(ROW, sort=False):
         speed, label, iteration = speeds.loc[row], [*map(str, row)], own["time/iteration"]
-        others = [next(iter(processes.groupby(ROW, sort=False).groups)), *((peer, *row[1:]) for peer in peers)]
+        others = [tuple(processes[ROW].iloc[0]), *((peer, *row[1:]) for peer in peers)]
         ratios = ["–" if row == other else spread(speed / speeds.loc[other], 2) for other in others]
-        ends = [spread(own["peak_mb"]), spread(own["time/first_iteration"], 1)]
-        speed_table.append([*label, spread(speed), *ratios, *ends])
+        process = [spread(own["peak_mb"]), spread(own["time/first_iteration"], 1)]
+        speed_table.append([*label, spread(speed), *ratios, *process])
         if row[0] not in peers:
-            parts = [(own[phase].median(), (own[phase] / iteration).median()) for phase in phases]
-            cells = [f"{1000 * seconds:.0f} ({share:.1%})" for seconds, share in parts]
+            shares = (own[phases].div(iteration, axis=0)).median()
+            cells = [f"{1000 * own[phase].median():.0f} ({shares[phase]:.1%})" for phase in phases]
             phase_table.append([*label, f"{1000 * iteration.median():.0f}", *cells])
         if LIMITS[0] in own:
             *gflops, emulator = own[LIMITS].iloc[0]
             network = [1000 * limit / (AGENT_STEP + (0 if row[0] in peers else KL_PASS)) for limit in gflops]
             limits = [*network, emulator, *(1 / (1 / limit + 1 / emulator) for limit in network)]
             limits_table.append([*label, *(f"{speed.median() / limit:.0%} of {limit:,.0f}" for limit in limits)])
-    to_others = ["× first row", *(f"× {peer}" for peer in peers)]
     bounds = ["float32 convolutions", "bfloat16 convolutions", "bare emulator"]
-    in_turn = [f"{bound} and emulator in turn" for bound in bounds[:2]]
-    return [
-        markdown([*ROW, "steps/s", *to_others, "peak MB a process", "first iteration after, s"], speed_table),
-        markdown([*ROW, "iteration, ms", *phases.str.removeprefix("time/")], phase_table),
-        *([markdown([*ROW, *bounds, *in_turn], limits_table)] if limits_table else []),
-    ]
+    bounds += [f"{bound} and emulator in turn" for bound in bounds[:2]]
+    ratio_names = ["× first row", *(f"× {peer}" for peer in peers)]
+    speed_names = ["steps/s", *ratio_names, "peak MB a process", "first iteration after, s"]
+    phase_names = ["iteration, ms", *phases.str.removeprefix("time/")]
+    tables = [(speed_names, speed_table), (phase_names, phase_table), (bounds, limits_table)]
+    return [markdown([*ROW, *names], table) for names, table in tables if table]
 
 
 def main() -> None:
@@ -310,9 +306,10 @@ def main() -> None:
     rom, _ = find_atari_game(args.env_id) or ("", 0.0)
     limits, processes = {}, []
     for num_envs, threads in itertools.product(args.num_envs, args.threads) if rom else ():
-        speeds = [call_in_process(probe_convolutions, threads, dtype) for dtype in ("float32", "bfloat16")]
-        speeds.append(call_in_process(probe_emulator, rom, num_envs, threads))
-        limits[num_envs, threads] = dict(zip(LIMITS, speeds))
+        gflops = [call_in_process(probe_convolutions, threads, dtype) for dtype in ("float32", "bfloat16")]
+        limits[num_envs, threads] = dict(
+            zip(LIMITS, [*gflops, call_in_process(probe_emulator, rom, num_envs, threads)])
+        )
     for number, setting in itertools.product(range(1, args.rounds + 1), settings):
         candidate = setting["candidate"]
         about = {**call, "commit": candidate.commit, "torch": candidate.torch, **setting, "candidate": candidate.name}

@@ -25,10 +25,9 @@ def call(monkeypatch, capfd):
 
 
 def test_interpolation_is_linear_in_the_log_of_the_bound():
-    bounds, falling = [0.01, 0.1, 1.0], [0.3, 0.2, 0.0]
-    assert match.interpolate(bounds, falling, 0.2, rises=False) == pytest.approx(0.1)
-    assert match.interpolate(bounds, falling, 0.25, rises=False) == pytest.approx(0.1 / math.sqrt(10))
-    assert match.interpolate(bounds, [0, 0.2, 0.3], 0.25, rises=True) == pytest.approx(0.1 * math.sqrt(10))
+    find = lambda means, rises: match.interpolate([0.01, 0.1, 1.0], means, 0.25, rises)  # noqa: E731
+    assert find([0.3, 0.2, 0.0], rises=False) == pytest.approx(0.1 / math.sqrt(10))
+    assert find([0, 0.2, 0.3], rises=True) == pytest.approx(0.1 * math.sqrt(10))
 
 
 def test_match_is_not_found_beyond_the_bounds_or_among_noise():
@@ -43,7 +42,7 @@ def test_impossible_arguments_are_refused(flags, call):
 
 
 @pytest.mark.parametrize("on", ["clipfrac", "kl"])
-def test_search_trains_the_matched_variant_and_the_other_at_each_bound(on, call, monkeypatch):
+def test_search_trains_matched_variant_and_the_other_at_each_bound(on, call, monkeypatch):
     matched, tried, _, _, rises = match.SEARCHES[on]
 
     def train(curve, *command):
@@ -76,8 +75,8 @@ def test_failing_script_ends_the_search(call, monkeypatch, tmp_path):
 @pytest.mark.slow
 def test_tight_bound_clips_more_and_moves_the_policy_less(call):
     for on, bounds in (("clipfrac", ("1e-4", "10")), ("kl", ("1e-4", "0.9"))):
-        flags = ("--games", "CartPole-v1", "--iterations", "2", "--jobs", "2", "--bounds", *bounds)
-        status, out, said = call("--on", on, *flags)
+        flags = ("--games", "CartPole-v1", "--iterations", "2", "--jobs", "2")
+        status, out, said = call("--on", on, *flags, "--bounds", *bounds)
         _, _, tight, wide, bound = (cell.strip() for cell in out.splitlines()[2].strip("|").split("|"))
         assert status == 0 and (float(tight) > float(wide)) == (on == "clipfrac"), said
         assert float(bounds[0]) < float(bound) <= float(bounds[1]) and out.endswith(f" = {bound}\n")

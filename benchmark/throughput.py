@@ -83,9 +83,8 @@ class Args:
     def rules(self) -> list[tuple[str, bool, str]]:
         """Returns (argument, does it hold, advice) for each rule that its type does not say."""
         _, sticky = find_atari_game(self.env_id) or ("", 1.0)
-        numbers = "threads", "jobs", "num_envs"
         return [
-            *((name, all(n > 0 for n in getattr(self, name)), "give numbers above 0") for name in numbers),
+            *((name, min(getattr(self, name)) > 0, "give numbers above 0") for name in ("threads", "jobs", "num_envs")),
             ("candidates", bool(self.candidates), "name a script, for example ppo_atari.py"),
             ("env_id", not sticky or not (self.peer or self.cleanrl), "peers need a game such as Breakout"),
             ("cleanrl", not self.cleanrl or (self.cleanrl / CLEANRL).is_file(), f"there is no {CLEANRL} in it"),
@@ -122,20 +121,19 @@ def make_candidates(args: Args) -> list[Candidate]:
 
             checkpoint = candidates[-1].checkpoint = Path(command[command.index("--resume") + 1]) / "checkpoint.pt"
             candidates[-1].first_step = torch.load(checkpoint, weights_only=True)["global_step"]
+    game = f"{canonical_name(args.env_id)}NoFrameskip-v4"  # as peers name it
     if args.peer:
         name = f"Stable-Baselines3 {importlib.metadata.version('stable-baselines3')}"
-        script = str(Path(__file__).with_name("sb3_ppo.py"))
-        command = [sys.executable, script, "--env-id", f"{canonical_name(args.env_id)}NoFrameskip-v4"]
-        candidates.append(Candidate(name, command, git_commit(script), version, peer=True))
+        command = [sys.executable, str(Path(__file__).with_name("sb3_ppo.py")), "--env-id", game]
+        candidates.append(Candidate(name, command, git_commit(__file__), version, peer=True))
     if args.cleanrl:
         checkout, python = str(args.cleanrl.resolve()), args.cleanrl_python
         ask = [python, "-c", "import importlib.metadata; print(importlib.metadata.version('torch'))"]
         version = subprocess.run(ask, check=True, capture_output=True, text=True).stdout.strip()
         # The prefix has Gymnasium import ale-py: under 0.29 the versions that ship ROMs do not register by themselves
-        game = f"ale_py:{canonical_name(args.env_id)}NoFrameskip-v4"
-        command = [os.path.abspath(shutil.which(python)), f"{checkout}/{CLEANRL}", "--env-id", game, "--no-cuda"]
-        commit, variables = git_commit(command[1], checkout), {"PYTHONPATH": checkout}
-        candidates.append(Candidate("CleanRL", command, commit, version, peer=True, variables=variables))
+        python, script = os.path.abspath(shutil.which(python)), f"{checkout}/{CLEANRL}"
+        command, commit = [python, script, "--env-id", f"ale_py:{game}", "--no-cuda"], git_commit(script, checkout)
+        candidates.append(Candidate("CleanRL", command, commit, version, True, {"PYTHONPATH": checkout}))
     return candidates
 
 
@@ -196,9 +194,10 @@ def measure(log: pd.DataFrame, start: float, end: float) -> dict[str, float]:
     if len(log) < 2:
         sys.exit("the jobs have no iteration in common after their warm-up: give a longer --window")
     seconds, phases = log["end"].diff()[1:], log.filter(like="time/")[1:]
+    if len(phases.columns):
+        phases["time/unaccounted"] = seconds - phases.sum(axis=1)
     speed = np.ptp(log["step"]) / seconds.sum()
-    unaccounted = {"time/unaccounted": (seconds - phases.sum(axis=1)).median()} if len(phases.columns) else {}
-    return {"steps_per_second": speed, "time/iteration": seconds.median(), **phases.median(), **unaccounted}
+    return {"steps_per_second": speed, "time/iteration": seconds.median(), **phases.median()}
 
 
 def run_process(setting: dict, iterations: int, directory: Path) -> tuple[pd.DataFrame, dict[str, float]]:
@@ -217,7 +216,7 @@ def run_process(setting: dict, iterations: int, directory: Path) -> tuple[pd.Dat
         command += ["--log-dir", str(directory)]
     command += [] if candidate.peer else ["--threads", threads]
     started, cwd = time.time(), directory if candidate.peer else None
-    child = subprocess.Popen(command, cwd=cwd, env=variables, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    child = subprocess.Popen(command, cwd=cwd, env=variables, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(child.pid, 0)
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode != 0:
@@ -298,7 +297,7 @@ def main() -> None:
     # The candidates of one setting follow each other, so that the closest comparisons are closest in time
     products = itertools.product(args.num_envs, args.threads, args.jobs, candidates)
     settings = [dict(zip(ROW, (candidate, *numbers))) for *numbers, candidate in products]
-    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if sys.platform == "linux" else ""
     cpu = (re.findall(r"model name\s*: (.*)", cpuinfo) or ["unknown processor"])[0]
     call = {"call": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "env_id": args.env_id, "cpu": cpu}
     call |= {"kind": call_in_process(processor_kind), "warmup": args.warmup, "window": args.window}
@@ -321,7 +320,7 @@ def main() -> None:
         print(f"round {number}, {' / '.join(str(about[name]) for name in ROW)}: {speed:,.0f} steps/s", file=sys.stderr)
 
     tables = make_tables(pd.DataFrame(processes), [candidate.name for candidate in candidates if candidate.peer])
-    machine = f"{cpu}, {call['kind']}, {available_cores()} cores, torch {candidates[0].torch}, {candidates[0].commit}"
+    machine = f"{cpu}, {call['kind']}, {available_cores()} cores, torch {candidates[0].torch}"
     window = f"{args.rounds} rounds of {args.window} iterations after {args.warmup}"
     print(f"{args.env_id} on {machine}; {window}; median (minimum to maximum).\n", *tables, sep="\n")
 

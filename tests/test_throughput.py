@@ -112,8 +112,7 @@ def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatc
     assert rows["peak_mb"].between(50, 5000).all()  # an interpreter with torch, and no more
     work = ("inference", "environment", "update", "kl_pass", "first_iteration")
     assert (rows[[f"time/{name}" for name in work]] > 0).all(axis=None)
-    assert rows["torch"][0].startswith("2.13.0") and rows["kind"][0] == bookkeeping.processor_kind()
-    assert rows[["cpu", "commit"]].notna().all(axis=None)
+    assert rows["kind"][0] == bookkeeping.processor_kind() and rows[["cpu", "commit", "torch"]].notna().all(axis=None)
 
 
 def test_rows_with_other_phases_are_added_and_known_ones_stay(tmp_path):
@@ -165,8 +164,7 @@ def test_failing_process_ends_the_call_and_rows_before_it_stay(tmp_path, monkeyp
     monkeypatch.setattr(throughput, "run_jobs", lambda *words: answers.pop() if answers else run_jobs(*words))
     monkeypatch.chdir(tmp_path)
     (tmp_path / "script.py").write_text("raise SystemExit(3)")
-    flags = "script.py script.py --env-id CartPole-v1 --csv x.csv"
-    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags.split()])
+    monkeypatch.setattr(sys, "argv", "x script.py script.py --env-id CartPole-v1 --csv x.csv".split())
     with pytest.raises(SystemExit, match=r"\(2\) ended with status 3"):
         throughput.main()
     assert len(pd.read_csv("x.csv")) == 1

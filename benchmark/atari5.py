@@ -30,7 +30,7 @@ import filelock
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
-from bookkeeping import PositiveInt, Progress, StopSignal, available_cores, check_bounds, code_hash, usage_error
+from bookkeeping import PositiveInt, Progress, StopSignal, available_cores, check_args, code_hash, usage_error
 from wrappers import canonical_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -120,7 +120,7 @@ def read_variant(word: str, total_timesteps: int) -> Variant:
         exec(compile(text, script, "exec"), vars(module))
         grid_flags = [f"--total-timesteps={total_timesteps}", f"--exp-name={name}"]
         arguments = tyro.cli(module.Args, prog=script, args=[*flags, *grid_flags])
-        check_bounds(arguments)
+        check_args(arguments)
         return Variant(name, script, text, code_hash(script), flags, vars(arguments))
     except (Exception, SystemExit) as error:  # a script may raise anything; of SystemExit tyro has said the reason
         usage_error(given, f"cannot be trained ({type(error).__name__}: {error})")
@@ -271,7 +271,7 @@ def main() -> None:
         args.games = tuple(map(canonical_name, args.games))  # as in the names of directories
     except ValueError as error:
         usage_error(f"--games {' '.join(args.games)}", error)
-    check_bounds(args)
+    check_args(args)
     if len(args.seeds) == 1 and args.seeds[0] > 1:
         print(f"--seeds {args.seeds[0]} is one seed; two would be --seeds 1 2, for example", file=sys.stderr)
     variants = [read_variant(word, args.total_timesteps) for word in dict.fromkeys(args.variants)]

@@ -26,7 +26,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
 from benchmark.readme import markdown
-from bookkeeping import NonNegativeInt, PositiveInt, available_cores, check_bounds
+from bookkeeping import NonNegativeInt, PositiveInt, available_cores, check_args
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -81,7 +81,7 @@ def interpolate(bounds: list[float], means: list[float], wanted: float, rises: b
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    check_bounds(args)
+    check_args(args)
     matched, tried, symbol, bounds, rises = SEARCHES[args.on]
     bounds = sorted(args.bounds or bounds)
     variants = [matched, *((*tried, "--clip-coef", str(bound)) for bound in bounds)]

@@ -36,7 +36,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
 from benchmark.readme import markdown
-from bookkeeping import PositiveInt, available_cores, check_bounds, git_commit, processor_kind, usage_error, write_file
+from bookkeeping import PositiveInt, available_cores, check_args, git_commit, processor_kind, usage_error, write_file
 from wrappers import canonical_name, find_atari_game
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -291,7 +291,7 @@ def make_tables(processes: pd.DataFrame, peers: list[str]) -> list[str]:
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    check_bounds(args)
+    check_args(args)
     candidates = make_candidates(args)
     add_rows(args.csv, [])  # refused now if it cannot be written
     # The candidates of one setting follow each other, so that the closest comparisons are closest in time

@@ -160,16 +160,9 @@ class Progress(NamedTuple):
 
 
 # ---------------------------------------------------------------------------------------------------- arguments
-class Bounds(NamedTuple):
-    """The values that an argument may have, within its type."""
-
-    allow: Callable[[Any], bool]
-    shown: str
-
-
 def bounded(kind: type, allow: Callable[[Any], bool], shown: str) -> Any:
     """Returns the type of a field of `Args` with bounds, which `--help` shows and `check_args` enforces."""
-    return Annotated[kind, Bounds(allow, shown), tyro.conf.arg(metavar=shown)]
+    return Annotated[kind, (allow, shown), tyro.conf.arg(metavar=shown)]
 
 
 PositiveInt = bounded(int, lambda x: 0 < x <= 10**12, "1..10^12")
@@ -226,9 +219,9 @@ def check_args(args) -> None:
     for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
         for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # X, or in `X | None` its parts
-            for bounds in getattr(kind, "__metadata__", ()):
-                if isinstance(bounds, Bounds) and not bounds.allow(value):
-                    usage_error(as_flag(name, value), f"give a value in {bounds.shown}")
+            for allow, shown in (bounds for bounds in getattr(kind, "__metadata__", ()) if isinstance(bounds, tuple)):
+                if not allow(value):
+                    usage_error(as_flag(name, value), f"give a value in {shown}")
     for name, holds, advice in args.rules():
         if not holds:
             usage_error(as_flag(name, getattr(args, name)), advice)

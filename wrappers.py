@@ -209,15 +209,12 @@ class EpisodicLife(VectorWrapper):
         super().__init__(envs)
         action_set = envs.unwrapped.ale.get_action_set()
         self.fire = action_set.index(ale_py.Action.FIRE) if ale_py.Action.FIRE in action_set else None
-        self.life_starts = np.zeros(self.num_envs, dtype=bool)
 
     def reset(self, *, seed: Sequence[int] | int | None = None, options: dict | None = None):
-        """Resets all games, or those that a mask names, `options={"reset_mask": …}` (N,)."""
-        mask = (options or {}).get("reset_mask", np.ones(self.num_envs, dtype=bool))
         # ale-py takes an int or an array, Gymnasium's SyncVectorEnv an int or a list
         obs, infos = self.env.reset(seed=np.array(seed) if isinstance(seed, Sequence) else seed, options=options)
         self.lives = infos["lives"]
-        self.life_starts |= mask
+        self.life_starts = np.ones(self.num_envs, dtype=bool)
         return obs, infos
 
     def step(self, actions: np.ndarray):

@@ -114,43 +114,10 @@ def test_games_match_a_frame_by_frame_reference(rom, num_steps, expect):
     assert expect <= seen
 
 
-def test_breakout_counts_five_lives_down_and_gives_one_score_a_game():
-    """With a policy that only says NOOP, which would stand still without FIRE."""
-    envs = make_envs("Breakout", 1)
-    _, infos = envs.reset(seed=env_seeds(1, 1))
-    lives, life_ends, scores = [int(infos["lives"][0])], 0, []
-    while not scores:
-        _, _, terminations, _, infos = envs.step(np.array([0]))
-        life_ends += int(terminations[0])
-        if "episode" in infos:
-            scores += list(infos["episode"]["r"])
-        elif infos["lives"][0] != lives[-1]:
-            lives.append(int(infos["lives"][0]))
-    assert lives == [5, 4, 3, 2, 1]
-    assert life_ends == 5  # four lost lives and the end of the game
-    assert len(scores) == 1
-
-
 def test_a_game_starts_with_0_to_29_noops():
     """The seed is chosen: among its games are one with the fewest no-ops and one with the most that there can be."""
     frames = make_envs("Breakout", 5).reset(seed=env_seeds(1, 5))[1]["episode_frame_number"]
     assert (frames.min(), frames.max()) == (0, 29)
-
-
-def test_sticky_actions_are_played_in_the_ale_id_alone():
-    """Without them two games from the same start that are played alike stay alike, whatever their random generators."""
-
-    def screens(env_id: str) -> np.ndarray:
-        envs = make_envs(env_id, 2)
-        _, infos = envs.reset(seed=env_seeds(0, 8)[3:5])  # chosen: two seeds with the same number of no-ops
-        first, second = infos["episode_frame_number"]
-        assert first == second
-        for action in [1, 2, 2, 3, 3, 2, 3, 2, 2, 3] * 3:
-            obs = envs.step(np.full(2, action))[0]
-        return obs
-
-    assert np.array_equal(*screens("Breakout"))
-    assert not np.array_equal(*screens("ALE/Breakout-v5"))
 
 
 def test_every_registered_game_is_found_by_its_bare_name():
@@ -334,13 +301,3 @@ def test_pictures_that_no_video_can_show_are_refused(own_infos, screen):
     own_infos.kwargs["screens"] = [screen]
     with pytest.raises(ValueError, match="no video can be made of it"):
         make_envs("OwnInfos-v0", 1, video="none.mp4")
-
-
-def test_a_reset_of_some_games_presses_fire_in_those_alone():
-    envs = make_envs("Breakout", 2)
-    envs.reset(seed=env_seeds(1, 2))
-    for _ in range(3):
-        envs.step(np.zeros(2, int))
-    assert envs.env.life_starts.tolist() == [False, False]
-    envs.reset(options={"reset_mask": np.array([False, True])})
-    assert envs.env.life_starts.tolist() == [False, True]

@@ -83,7 +83,7 @@ class Args(RunArgs):
     """weight of the advantage in the clip range ε / (1 + c·|Â|) (section 3.1): 0 is PPO, `inf` the range δ / |Â|, which
     is the thesis's product-only objective"""
     clip_vloss: bool = True
-    """clip the value loss as CleanRL does; `--no-clip-vloss` gives half the squared error, as appendix B"""
+    """clip the value loss as CleanRL does; `--no-clip-vloss` gives half the squared error (appendix B: all of it)"""
     vf_clip_coef: PositiveFloat = 0.1
     """how far a value may move towards its return in one iteration before its gradient is cut off, in units of return
     (CleanRL reuses clip_coef; a coefficient of its own keeps ε out of the value loss)"""

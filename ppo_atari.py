@@ -77,7 +77,7 @@ class Args(RunArgs):
     clip_coef: PositiveFloat = 0.1
     """clip range of the probability ratio, ε (2.14, appendix A)"""
     clip_vloss: bool = True
-    """clip the value loss as CleanRL does; `--no-clip-vloss` gives half the squared error, as appendix B"""
+    """clip the value loss as CleanRL does; `--no-clip-vloss` gives half the squared error (appendix B: all of it)"""
     vf_clip_coef: PositiveFloat = 0.1
     """how far a value may move towards its return in one iteration before its gradient is cut off, in units of return
     (CleanRL reuses clip_coef; a coefficient of its own keeps ε out of the value loss)"""

@@ -38,7 +38,7 @@ ROOT = Path(__file__).resolve().parent.parent
 VARIANTS = {  # a script of this project and its flags
     "ppo": "ppo_atari.py --clip-coef 0.1",  # the thesis's two, chapter 4
     "acppo": "acppo_atari.py --clip-coef 0.16 --c 1.0",
-    "ppo-matched": "ppo_atari.py --clip-coef 0.084",  # adaptation or smaller steps? Its KL on Qbert is AC-PPO's
+    "ppo-matched": "ppo_atari.py --clip-coef 0.084",  # adaptation or smaller steps? Its KL is nearer AC-PPO's
     "ppo-wide": "ppo_atari.py --clip-coef 0.16",  # is it the adaptation, or the width?
     "product": "acppo_atari.py --clip-coef 0.027 --c inf",  # only the product is bounded, by δ (δ by match.py)
     **{f"acppo-c{c}": f"acppo_atari.py --clip-coef 0.16 --c {c}" for c in (0.25, 0.5, 2, 4)},  # sensitivity to c ...

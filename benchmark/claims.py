@@ -33,7 +33,7 @@ mean: the human score of DoubleDunk is 2.2 points above random.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -44,8 +44,10 @@ from benchmark.collect import Curves, Runs
 
 FINISHED = 0.9  # of its schedule
 FEWEST_PAIRS = 3
-# Published scores; after 0 agent steps, those of humans and of random play
-SCORES = pd.read_csv(Path(__file__).parent / "scores.csv", encoding="utf-8").fillna({"agent_steps": 0, "note": ""})
+SCORES = pd.read_csv(Path(__file__).parent / "scores.csv", encoding="utf-8").fillna({"note": ""})  # published ones
+# Game → scores of human and random play, which have no agent steps, and their difference
+PLAYED = SCORES[SCORES.agent_steps.isna()].pivot(index="game", columns="source", values="score_mean")
+PLAYED = PLAYED.assign(range=PLAYED.human - PLAYED.random)
 UNDECIDED = "cannot be told apart with these runs"
 DRAWS = 10_000  # of the bootstrap
 VARIANT_ORDER = ("ppo", "acppo", "ppo-matched", "ppo-wide", "product")  # the thesis's two first; others by name
@@ -75,14 +77,12 @@ def make_stages(runs: Runs, curves: Curves, baseline: str = "ppo", challenger: s
     stages = [Stage(name, baseline, challenger, epsilon) for name in ("finished", "unfinished")]
     for game in games(curves):
         keys = sorted((key for key in curves if key[1] == game), key=lambda key: (order.index(key[0]), key[2]))
-        schedules = {key: runs[key]["total_timesteps"] for key in keys}
-        finished = {key: curves[key] for key in keys if curves[key].index[-1] >= FINISHED * schedules[key]}
+        ends = {key: curves[key].index[-1] for key in keys}
+        finished = {key: curves[key] for key in keys if ends[key] >= FINISHED * runs[key]["total_timesteps"]}
         stages[0].add(runs, finished, finished)
-        if len(finished) < len(keys):
-            longest = max(curves[key].index[-1] for key in keys if key not in finished)
+        if longest := max((ends[key] for key in keys if key not in finished), default=0):
             first_steps = {key: curves[key].loc[:longest] for key in keys}
-            long_enough = {key: curve for key, curve in first_steps.items() if curve.index[-1] >= longest / 2}
-            stages[1].add(runs, first_steps, long_enough)
+            stages[1].add(runs, first_steps, {key: first_steps[key] for key in keys if ends[key] >= longest / 2})
     return [stage for stage in stages if stage.runs]
 
 
@@ -109,12 +109,6 @@ def epsilons(runs: Runs) -> dict[str, float]:
     """Returns each variant's ε, its widest clip range, if it has one; with c = inf the range has no bound."""
     bounded = {key[0]: run["arguments"] for key, run in runs.items() if str(run["arguments"].get("c")) != "inf"}
     return {name: args["clip_coef"] for name, args in bounded.items() if "clip_coef" in args}
-
-
-def human_ranges(of_games: Iterable[str]) -> dict[str, tuple[float, float]]:
-    """Returns the random score of each of these games that has one, and how far the human score is above it."""
-    table = SCORES[SCORES.game.isin(of_games)].pivot(index="game", columns="source", values="score_mean")
-    return {game: (row["random"], row["human"] - row["random"]) for game, row in table.iterrows()}
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
@@ -168,8 +162,7 @@ def find_margins(stage: Stage) -> dict[str, dict[str, np.ndarray]]:
 
 def in_human_ranges(margins: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Returns differences of scores in units of human minus random score, of the games that have these."""
-    ranges = human_ranges(margins)
-    return {game: values / ranges[game][1] for game, values in margins.items() if game in ranges}
+    return {game: values / PLAYED.range[game] for game, values in margins.items() if game in PLAYED.index}
 
 
 def judge(fewest_pairs: int, margins: Sequence[float] | None) -> str:

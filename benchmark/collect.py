@@ -69,8 +69,12 @@ def collect(out: Path, directories: Sequence[Path] = (), note: str = "") -> list
         if path in found or records.get(path, record)["source"] != record["source"]:
             usage_error(f"{directory}", f"{path} holds another run; give --note NOTE to keep both")
         found[path] = record, curve
-    for path, (record, curve) in found.items():
-        write_run(path, record, curve)
+    for path, (record, curve) in found.items():  # equal content gives equal bytes
+        path.mkdir(parents=True, exist_ok=True)
+        rows = curve.to_csv(float_format="%.6g", lineterminator="\n")
+        write_file(path / "curve.csv.gz", gzip.compress(rows.encode(), mtime=0))
+        # Last: a run that has it is whole
+        write_file(path / "run.json", json.dumps(record, indent=2, ensure_ascii=False) + "\n")
     return list(found)
 
 
@@ -79,10 +83,14 @@ def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
     about = json.loads((directory / "args.json").read_text(encoding="utf-8"))
     files = sorted(directory.glob("events.out.tfevents*"))  # by their names, in the order of the run's starts
     readers = [EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload() for file in files]  # 0: all points
-    args, curve, wall = about["args"], read_curve(readers), sum(map(read_hours, readers))
-    if not len(curve):
+    tags = [(start, tag) for start, reader in enumerate(readers) for tag in reader.Tags()["scalars"]]
+    events = {(start, tag): pd.DataFrame(map(vars, readers[start].Scalars(tag))) for start, tag in tags}
+    logged = pd.concat(events, names=["start", "tag"]).reset_index()  # columns: start, tag, wall_time, step, value
+    args, curve, provenance = about["args"], make_curve(logged), read_provenance(readers, about["provenance"])
+    if curve.empty:
         raise ValueError("it has no iterations")
-    provenance = read_provenance(readers, about["provenance"])
+    ends = logged.groupby("start").wall_time.max()  # of each start; a pause lies between two of them
+    wall = sum(end - readers[start].FirstEventTimestamp() for start, end in ends.items()) / 3600
     return {
         "variant": args["exp_name"],
         "game": args["env_id"],
@@ -101,20 +109,13 @@ def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
     }, curve
 
 
-def read_curve(readers: list[EventAccumulator]) -> pd.DataFrame:
+def make_curve(logged: pd.DataFrame) -> pd.DataFrame:
     """Returns the tags in TAGS by agent step, and the games ended so far; of a step logged twice, the last."""
-    points, game_ends = [], []
-    for reader in readers:
-        logged = reader.Tags()["scalars"]
-        for column, tag in TAGS.items():
-            if tag in logged:
-                points += [(event.step, column, event.value) for event in reader.Scalars(tag)]
-        if "charts/episodic_return" in logged:
-            game_ends += [event.step for event in reader.Scalars("charts/episodic_return")]
-    table = pd.DataFrame(points, columns=["step", "column", "value"])
-    table = table.drop_duplicates(["step", "column"], keep="last")
-    table = table.pivot(index="step", columns="column", values="value").reindex(columns=list(TAGS)).sort_index()
-    return table.assign(games_ended=np.searchsorted(np.sort(game_ends), table.index, side="right"))
+    table = logged[logged.tag.isin(TAGS.values())].drop_duplicates(["tag", "step"], keep="last")
+    table = table.pivot(index="step", columns="tag", values="value").reindex(columns=list(TAGS.values()))
+    game_ends = np.sort(logged.step[logged.tag == "charts/episodic_return"])
+    games_ended = np.searchsorted(game_ends, table.index, side="right")
+    return table.set_axis(list(TAGS), axis=1).assign(games_ended=games_ended)
 
 
 def read_provenance(readers: list[EventAccumulator], last: dict[str, object]) -> dict[str, str]:
@@ -128,13 +129,6 @@ def read_provenance(readers: list[EventAccumulator], last: dict[str, object]) ->
     return {name: "; ".join(dict.fromkeys(of_starts)) for name, of_starts in values.items()}
 
 
-def read_hours(reader: EventAccumulator) -> float:
-    """Returns the hours of one start of a run, from its first event to its last; pauses lie between two starts."""
-    first = reader.FirstEventTimestamp()
-    last = max((reader.Scalars(tag)[-1].wall_time for tag in reader.Tags()["scalars"]), default=first)
-    return (last - first) / 3600
-
-
 def read_evaluation(file: Path) -> dict[str, float | None] | None:
     """Returns games, mean and sample standard deviation of the last evaluation in eval.csv, None without one."""
     if not file.exists():
@@ -143,14 +137,6 @@ def read_evaluation(file: Path) -> dict[str, float | None] | None:
     last = table[table.index >= table.index[table.game == 1].max()]  # each evaluation begins with game 1
     mean, std = (float(f"{number:.6g}") for number in (last.score.mean(), last.score.std(ddof=1)))
     return {"games": len(last), "mean": mean, "std": std if len(last) > 1 else None}
-
-
-def write_run(path: Path, record: dict, curve: pd.DataFrame) -> None:
-    """Writes a run directory, run.json last: one that has it is whole. Equal content gives equal bytes."""
-    path.mkdir(parents=True, exist_ok=True)
-    rows = curve.to_csv(float_format="%.6g", lineterminator="\n")
-    write_file(path / "curve.csv.gz", gzip.compress(rows.encode(), mtime=0))
-    write_file(path / "run.json", json.dumps(record, indent=2, ensure_ascii=False) + "\n")
 
 
 def read_records(out: Path) -> dict[Path, dict]:
@@ -174,9 +160,7 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     paths = collect(args.out, args.training_directories, args.note)
     if not paths:
-        usage_error(
-            f"--out {args.out}", "nothing to collect; give training directories in which an iteration has ended"
-        )
+        usage_error(f"--out {args.out}", "give training directories in which an iteration has ended")
     print(*paths, sep="\n")
 
 

@@ -14,7 +14,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter, NullFormatter
 from PIL import Image
 
-from benchmark.claims import Stage, games, seeds, variants
+from benchmark.claims import VARIANT_ORDER, Stage, games, seeds, variants
 from benchmark.collect import Curves
 from bookkeeping import write_file
 from wrappers import FRAME_SKIP, find_atari_game
@@ -25,10 +25,10 @@ FIGURES = {
     "kl": ("KL divergence between policy updates", {"kl": "exact, nats", "old_approx_kl": "estimate, nats"}),
     "avg_clip_ratio": ("Average clip ratio", {"avg_clip_ratio": "mean clip range"}),
 }
-# Okabe and Ito's colours, which colour-blind readers can tell apart
-COLOURS = {"ppo": "#0072B2", "acppo": "#D55E00", "ppo-matched": "#E69F00", "ppo-wide": "#56B4E9", "product": "#009E73"}
-SPARE_COLOURS = ("#CC79A7", "#F0E442", "#000000")  # of other variants, by name
-SETTINGS = {"font.size": 11, "legend.title_fontsize": 13, "savefig.dpi": 80}
+# Okabe and Ito's, which colour-blind readers can tell apart: of VARIANT_ORDER, then of other variants by name
+COLOURS = ["#0072B2", "#D55E00", "#E69F00", "#56B4E9", "#009E73", "#CC79A7", "#F0E442", "#000000"]
+SETTINGS = {"font.size": 11, "legend.title_fontsize": 13, "savefig.dpi": 80, "legend.frameon": False}
+SETTINGS |= {"axes.titlesize": "small", "axes.grid": True, "grid.color": "0.9", "axes.axisbelow": True}
 
 
 def draw(stage: Stage, directory: Path) -> None:
@@ -46,25 +46,22 @@ def draw(stage: Stage, directory: Path) -> None:
 def draw_figure(name: str, stage: Stage) -> Figure:
     (title, columns), curves = FIGURES[name], stage.drawn
     size = (max(9, 2.6 * len(games(curves))), 1 + 2.6 * len(columns))  # inches
-    figure = Figure(figsize=size, layout="constrained", facecolor="white")
+    figure = Figure(figsize=size, layout="constrained")
     sharey = False if name == "score" else "row"  # points of two games do not compare
     axes = figure.subplots(len(columns), len(games(curves)), squeeze=False, sharey=sharey)
     for axis, (column, game) in zip(axes.flat, itertools.product(columns, games(curves))):
         frames = FRAME_SKIP if find_atari_game(game) else 1
         draw_panel(axis, curves, game, column, frames)
         counts = ", ".join(str(len(seeds(curves, variant, game))) for variant in variants(curves))
-        axis.set_title(f"{game}\nn = {counts}", fontsize="small")
-        axis.set_xlabel("agent steps" if frames == 1 else "emulator frames")
+        x_label = "agent steps" if frames == 1 else "emulator frames"
+        axis.set(title=f"{game}\nn = {counts}", xlabel=x_label, xlim=(0, None))
         axis.set_ylabel(columns[column] if axis.get_subplotspec().is_first_col() else "")
-        axis.set_xlim(left=0)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.locator_params(axis="x", nbins=4)
-        axis.grid(color="0.9")
-        axis.set_axisbelow(True)
         if name == "avg_clip_ratio" and math.isfinite(stage.epsilon):
             axis.axhline(stage.epsilon, color=colour(curves, stage.baseline), linestyle="--", linewidth=1.5)
     lines = [Line2D([], [], linewidth=3, label=name, color=colour(curves, name)) for name in variants(curves)]
-    figure.legend(handles=lines, title=title, loc="outside upper center", ncols=6, frameon=False)
+    figure.legend(handles=lines, title=title, loc="outside upper center", ncols=6)
     return figure
 
 
@@ -96,5 +93,5 @@ def draw_panel(axis: Axes, curves: Curves, game: str, column: str, frames: int) 
 
 def colour(curves: Curves, variant: str) -> str:
     """Returns a variant's colour, the same in all figures."""
-    others = [name for name in variants(curves) if name not in COLOURS]
-    return COLOURS.get(variant) or SPARE_COLOURS[others.index(variant) % len(SPARE_COLOURS)]
+    order = dict.fromkeys([*VARIANT_ORDER, *variants(curves)])
+    return COLOURS[list(order).index(variant) % len(COLOURS)]

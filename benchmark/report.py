@@ -26,7 +26,7 @@ from benchmark.claims import UNDECIDED, Stage, games, pairs, seeds, share_above,
 from benchmark.collect import DEFAULT_OUT, ROOT, Curves, Runs
 from benchmark.figures import FIGURES, draw
 from benchmark.readme import markdown, write_part
-from bookkeeping import usage_error, write_file
+from bookkeeping import usage_error
 
 DISPLAY_NAMES = {"ppo": "PPO", "acppo": "AC-PPO"}  # the others' names are as they were given
 SIGNS = {"holds": "✓", "does not hold": "✗", UNDECIDED: "?"}
@@ -72,14 +72,14 @@ def titled(title: str, columns: list[str], rows: list[list[str]]) -> str:
 
 
 def score_table(curves: Curves) -> str:
-    rows, played = [], claims.SCORES.set_index(["game", "source"]).score_mean
+    rows = []
     for game in games(curves):
         row = [game, last_step(curves, game)]
         for runs in (seeds(curves, variant, game).values() for variant in variants(curves)):
             final, fewest = last_scores(runs), min((curve.games_ended.iloc[-1] for curve in runs), default=100)
             counts = f" (n = {len(final)}" + (f", {fewest} games)" if fewest < 100 else ")")
             row.append(plus_minus(final.mean(), final.std()) + (counts if len(final) else ""))
-        rows.append([*row, *(cell(played.get((game, source), math.nan), ",.1f") for source in ("random", "human"))])
+        rows.append([*row, *(cell(claims.PLAYED[who].get(game, math.nan), ",.1f") for who in ("random", "human"))])
     title = "Mean of the last 100 games (of all, where a seed has ended fewer): mean ± sample deviation over n seeds"
     return titled(title, ["game", "agent steps", *variants(curves), "random", "human"], rows)
 
@@ -111,14 +111,13 @@ def mean_and_interval(strata: list[np.ndarray], number="{:.3f}".format) -> tuple
 
 
 def human_table(stage: Stage) -> str:
-    curves, finals, rows = stage.compared, {}, []
-    ranges = claims.human_ranges(games(curves)).items()
+    curves, differences, rows = stage.compared, {}, []
     for name in variants(curves):
-        finals[name] = [(last_scores(seeds(curves, name, game).values()) - low) / size for game, (low, size) in ranges]
-    differences = claims.in_human_ranges(claims.find_margins(stage)["score"])
-    finals[f"{stage.challenger} − {stage.baseline}, by pairs"] = list(differences.values())
-    for name, of_games in finals.items():
-        if strata := [of_game for of_game in of_games if len(of_game)]:
+        scores = {game: last_scores(seeds(curves, name, game).values()) for game in games(curves)}
+        differences[name] = {game: of - claims.PLAYED.random.get(game, math.nan) for game, of in scores.items()}
+    differences[f"{stage.challenger} − {stage.baseline}, by pairs"] = claims.find_margins(stage)["score"]
+    for name, of_games in differences.items():
+        if strata := [of_game for of_game in claims.in_human_ranges(of_games).values() if len(of_game)]:
             counts = ", ".join(map(str, sorted(set(map(len, strata)))))
             rows.append([name, str(len(strata)), counts, *mean_and_interval(strata)])
     title = (
@@ -256,16 +255,9 @@ def main() -> None:
     for variant in {args.baseline, args.challenger} - known - {"ppo", "acppo"}:  # without these, there are figures
         usage_error(f"variant {variant}", f"no run is of it; give one of {', '.join(sorted(known))}")
     stages, prefix = claims.make_stages(runs, curves, args.baseline, args.challenger), args.note and f"{args.note}-"
-    page = args.out / f"{args.note or 'README'}.md"
-    if not page.exists():
-        write_file(page, f"# Results {args.note}".rstrip() + "\n\n<!-- results -->\n<!-- end results -->\n")
-    written = {page: results_part(stages, prefix)}
+    write_part(args.out / f"{args.note or 'README'}.md", results_part(stages, prefix))
     if args.out.resolve() == DEFAULT_OUT and (args.note, args.baseline, args.challenger) == ("", "ppo", "acppo"):
-        written[ROOT / "README.md"] = short_table(stages)
-    for path, part in written.items():
-        if not write_part(path, "results", part):
-            usage_error(str(path), "has no <!-- results --> … <!-- end results -->, once, to write between")
-        print(path)
+        write_part(ROOT / "README.md", short_table(stages))
     for stage in stages:
         draw(stage, args.out / "figures" / f"{prefix}{stage.name}")
 

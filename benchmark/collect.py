@@ -120,13 +120,11 @@ def make_curve(logged: pd.DataFrame) -> pd.DataFrame:
 
 def read_provenance(readers: list[EventAccumulator], last: dict[str, object]) -> dict[str, str]:
     """Returns what each start wrote to TensorBoard, each value once; `last` is the last start's, from args.json."""
-    tag, starts = "provenance/text_summary", []
-    for reader in readers:
-        for text in reader.Tensors(tag) if tag in reader.Tags()["tensors"] else []:
-            lines = text.tensor_proto.string_val[0].decode().splitlines()
-            starts.append(dict(line.strip("|").split("|", 1) for line in lines))
-    values = {name: [str(start.get(name, "unknown")) for start in starts or [last]] for name in last}
-    return {name: "; ".join(dict.fromkeys(of_starts)) for name, of_starts in values.items()}
+    tag = "provenance/text_summary"
+    events = [event for reader in readers if tag in reader.Tags()["tensors"] for event in reader.Tensors(tag)]
+    lines = [line for event in events for line in event.tensor_proto.string_val[0].decode().splitlines()]
+    pairs = [line.strip("|").split("|", 1) for line in lines] + [[name, str(value)] for name, value in last.items()]
+    return {name: "; ".join(dict.fromkeys(value for key, value in pairs if key == name)) for name in last}
 
 
 def read_evaluation(file: Path) -> dict[str, float | None] | None:

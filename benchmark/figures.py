@@ -1,6 +1,5 @@
 """Draws the thesis's figures of one stage of runs, a panel for each game, as PNGs. `report.py` calls it."""
 
-import io
 import itertools
 import math
 from pathlib import Path
@@ -16,7 +15,6 @@ from PIL import Image
 
 from benchmark.claims import VARIANT_ORDER, Stage, games, seeds, variants
 from benchmark.collect import Curves
-from bookkeeping import write_file
 from wrappers import FRAME_SKIP, find_atari_game
 
 # Figure → its title and the columns it shows, a row of panels for each, with its y axis
@@ -35,12 +33,11 @@ def draw(stage: Stage, directory: Path) -> None:
     """Writes DIRECTORY/NAME.png for each figure; equal curves give equal bytes."""
     directory.mkdir(parents=True, exist_ok=True)
     for name in FIGURES:
+        file = directory / f"{name}.png"
         with matplotlib.rc_context({**matplotlib.rcParamsDefault, **SETTINGS}):  # not the user's matplotlibrc
-            draw_figure(name, stage).savefig(drawn := io.BytesIO(), format="png")
+            draw_figure(name, stage).savefig(file)
         # 128 colours take a third of the bytes and look the same; with 64, two variants can become one
-        palette = Image.open(drawn).convert("RGB").quantize(128, dither=Image.Dither.NONE)
-        palette.save(small := io.BytesIO(), format="png", optimize=True)
-        write_file(directory / f"{name}.png", small.getvalue())
+        Image.open(file).convert("RGB").quantize(128, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
 def draw_figure(name: str, stage: Stage) -> Figure:

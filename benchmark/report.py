@@ -129,16 +129,16 @@ def human_table(stage: Stage) -> str:
 def kl_table(stage: Stage) -> str:
     rows, curves = [], stage.compared
     for game, variant in itertools.product(games(curves), variants(curves)):
-        if not (runs := list(seeds(curves, variant, game).values())):
-            continue
-        together, kl = pd.concat(runs), pd.concat([curve.kl for curve in runs])
-        relative = share_above(kl, claims.spike_limit(stage, game))
-        own = np.mean([claims.share_of_own_spikes(curve.kl) for curve in runs])
-        far = share_above(together.max_tv_distance, claims.epsilons(stage.runs).get(variant, math.nan) / 2)
-        row = [game, variant, str(len(runs)), last_step(curves, game)]
-        row += [f"{number:.3g}" for number in (kl.mean(), kl.median(), kl.quantile(0.99), kl.max())]
-        row += [cell(share, ".2%") for share in (relative, own, far)]
-        rows.append([*row, f"{together.avg_clip_ratio.mean():.4f}"])
+        if runs := list(seeds(curves, variant, game).values()):
+            together = pd.concat(runs)
+            kl = together.kl
+            relative = share_above(kl, claims.spike_limit(stage, game))
+            own = np.mean([claims.share_of_own_spikes(curve.kl) for curve in runs])
+            far = share_above(together.max_tv_distance, claims.epsilons(stage.runs).get(variant, math.nan) / 2)
+            row = [game, variant, str(len(runs)), last_step(curves, game)]
+            row += [f"{number:.3g}" for number in (kl.mean(), kl.median(), kl.quantile(0.99), kl.max())]
+            row += [cell(share, ".2%") for share in (relative, own, far)]
+            rows.append([*row, f"{together.avg_clip_ratio.mean():.4f}"])
     columns = ["game", "variant", "seeds", "agent steps", "mean KL", "median", "99th percentile", "maximum"]
     columns += [f"spikes: above {stage.baseline}'s 99th percentile", "spikes: above 10 × own median"]
     columns += ["largest TV distance above ε / 2", "average clip ratio"]

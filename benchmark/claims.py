@@ -63,32 +63,28 @@ class Stage:
     drawn: Curves = field(default_factory=dict)  # as far as the figures show them
     compared: Curves = field(default_factory=dict)  # as the tables and claims compare them
 
-    def add(self, runs: Runs, drawn: Curves, compared: Curves) -> None:
-        """Adds a game's runs, `compared` up to the last step that all of these have reached."""
-        end = min((curve.index[-1] for curve in compared.values()), default=0)
-        self.runs |= {key: runs[key] for key in drawn}
-        self.drawn |= drawn
-        self.compared |= {key: curve.loc[:end] for key, curve in compared.items()}
-
 
 def make_stages(runs: Runs, curves: Curves, baseline: str = "ppo", challenger: str = "acppo") -> list[Stage]:
     """Returns the stages that have runs, the finished one first; runs are sorted by game, variant and seed."""
-    order, epsilon = variants(curves), epsilons(runs).get(baseline, math.nan)
+    epsilon = epsilons(runs).get(baseline, math.nan)
     stages = [Stage(name, baseline, challenger, epsilon) for name in ("finished", "unfinished")]
     for game in games(curves):
-        keys = sorted((key for key in curves if key[1] == game), key=lambda key: (order.index(key[0]), key[2]))
+        keys = [(name, game, seed) for name in variants(curves) for seed in sorted(seeds(curves, name, game))]
         ends = {key: curves[key].index[-1] for key in keys}
         finished = {key: curves[key] for key in keys if ends[key] >= FINISHED * runs[key]["total_timesteps"]}
-        stages[0].add(runs, finished, finished)
-        if longest := max((ends[key] for key in keys if key not in finished), default=0):
-            first_steps = {key: curves[key].loc[:longest] for key in keys}
-            stages[1].add(runs, first_steps, {key: first_steps[key] for key in keys if ends[key] >= longest / 2})
+        longest = max((ends[key] for key in keys if key not in finished), default=0)
+        first_steps = {key: curves[key].loc[:longest] for key in keys if longest}
+        long_enough = {key: curve for key, curve in first_steps.items() if ends[key] >= longest / 2}
+        for stage, drawn, compared in zip(stages, (finished, first_steps), (finished, long_enough)):
+            end = min((curve.index[-1] for curve in compared.values()), default=0)
+            stage.runs |= {key: runs[key] for key in drawn}
+            stage.drawn |= drawn
+            stage.compared |= {key: curve.loc[:end] for key, curve in compared.items()}
     return [stage for stage in stages if stage.runs]
 
 
 def variants(curves: Curves) -> list[str]:
-    names = {variant for variant, _, _ in curves}
-    return [name for name in VARIANT_ORDER if name in names] + sorted(names - set(VARIANT_ORDER))
+    return sorted({variant for variant, _, _ in curves}, key=lambda name: ((*VARIANT_ORDER, name).index(name), name))
 
 
 def games(curves: Curves) -> list[str]:

@@ -25,11 +25,9 @@ This rule was committed eight minutes into the first two of the runs (8073f69), 
 all runs of a game are cut at one step, not each pair at its own (when the seeds had come to different lengths); the
 stages, and that final scores wait for 90 % of the schedule (when one pair had finished, in which ppo scores more).
 
-The interquartile mean is the mean of the middle half of the sorted values, those on its border counting with the part
-of them that is inside (scipy's trim_mean counts them whole). Its interval is the percentile bootstrap that draws seeds
-with replacement within each game. From three seeds it is too narrow: of two equal algorithms, three normal pairs on
-each of five games, it excludes 0 one time in ten, not in twenty (tests/test_results.py counts). It never is a plain
-mean: the human score of DoubleDunk is 2.2 points above random.
+The interval is the percentile bootstrap that draws seeds with replacement within each game. From three seeds it is too
+narrow: of two equal algorithms, three normal pairs on each of five games, it excludes 0 one time in ten, not in twenty
+(tests/test_results.py counts). A plain mean is never used: the human score of DoubleDunk is 2.2 points above random.
 """
 
 import math
@@ -108,7 +106,7 @@ def epsilons(runs: Runs) -> dict[str, float]:
 
 
 def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """(..., n) → (...): the mean of the middle half; a value on its border counts with its part inside."""
+    """(..., n) → (...): the mean of the middle half; of a value on its border, the part inside (scipy takes all)."""
     borders = np.linspace(0, 1, values.shape[-1] + 1)  # value i of the sorted ones covers borders[i] to borders[i + 1]
     weights = 2 * np.diff(borders.clip(0.25, 0.75))
     return np.sort(values, axis=-1) @ weights

@@ -73,8 +73,7 @@ def collect(out: Path, directories: Sequence[Path] = (), note: str = "") -> list
         path.mkdir(parents=True, exist_ok=True)
         rows = curve.to_csv(float_format="%.6g", lineterminator="\n")
         write_file(path / "curve.csv.gz", gzip.compress(rows.encode(), mtime=0))
-        # Last: a run that has it is whole
-        write_file(path / "run.json", json.dumps(record, indent=2, ensure_ascii=False) + "\n")
+        write_file(path / "run.json", json.dumps(record, indent=2, ensure_ascii=False) + "\n")  # the run is whole
     return list(found)
 
 
@@ -84,11 +83,11 @@ def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
     files = sorted(directory.glob("events.out.tfevents*"))  # by their names, in the order of the run's starts
     readers = [EventAccumulator(str(file), size_guidance={"scalars": 0}).Reload() for file in files]  # 0: all points
     tags = [(start, tag) for start, reader in enumerate(readers) for tag in reader.Tags()["scalars"]]
+    if not tags:
+        raise ValueError("it has no iterations")
     events = {(start, tag): pd.DataFrame(map(vars, readers[start].Scalars(tag))) for start, tag in tags}
     logged = pd.concat(events, names=["start", "tag"]).reset_index()  # columns: start, tag, wall_time, step, value
     args, curve, provenance = about["args"], make_curve(logged), read_provenance(readers, about["provenance"])
-    if curve.empty:
-        raise ValueError("it has no iterations")
     ends = logged.groupby("start").wall_time.max()  # of each start; a pause lies between two of them
     wall = sum(end - readers[start].FirstEventTimestamp() for start, end in ends.items()) / 3600
     return {

@@ -64,10 +64,8 @@ def draw_figure(name: str, stage: Stage) -> Figure:
 
 def draw_panel(axis: Axes, curves: Curves, game: str, column: str, frames: int) -> None:
     """Draws one column of a game's runs, all variants; a step is so many frames."""
-    for variant in variants(curves):
+    for variant in variants({key: curve for key, curve in curves.items() if key[1] == game}):
         table = pd.DataFrame({seed: curve[column] for seed, curve in seeds(curves, variant, game).items()})
-        if table.empty:
-            continue
         color, x = colour(curves, variant), table.index * frames
         if column == "mean_return_100":
             middle, std = table.mean(axis=1, skipna=False), table.std(axis=1, skipna=False)  # NaN for one seed

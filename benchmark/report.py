@@ -234,13 +234,10 @@ def results_part(stages: list[Stage], prefix: str = "") -> str:
     parts = [LEGEND]
     for stage in stages:
         parts += [f"## {stage.name.capitalize()} runs\n", coverage(stage)]
-        tables = {
-            "score": [score_table(stage.compared), published_table(stage.compared)],
-            "kl": [kl_table(stage)],
-            "avg_clip_ratio": [claims_table(stage), progress_table(stage)],
-        }
-        tables["score"] += [evaluation_table(stage.runs), human_table(stage)] if stage.name == "finished" else []
-        for name, below in tables.items():
+        scores = [score_table(stage.compared), published_table(stage.compared)]
+        scores += [evaluation_table(stage.runs), human_table(stage)] if stage.name == "finished" else []
+        tables = (scores, [kl_table(stage)], [claims_table(stage), progress_table(stage)])
+        for name, below in zip(FIGURES, tables):
             parts += [f"![{FIGURES[name][0]}](figures/{prefix}{stage.name}/{name}.png)\n", *filter(None, below)]
     return "\n".join(parts)
 

@@ -1,7 +1,7 @@
 """The thesis's experiments: a grid of variants × games × seeds, as many runs at once as there are cores for.
 
-    python benchmark/atari5.py                                       # the thesis's 30 runs, then their results page
-    python benchmark/atari5.py --seeds 1 --stop-at 200000            # the first 4 % of ten of them
+    python benchmark/atari5.py --out ../again                        # the thesis's 30 runs, then their results page
+    python benchmark/atari5.py --out ../again --seeds 1 --stop-at 200000  # the first 4 % of ten of them
     python benchmark/atari5.py --out ../mine --variants ppo "mine=my_ppo.py --clip-coef 0.2"  # your own script
     python benchmark/atari5.py --address auto --out /shared/results  # on the nodes of a Ray cluster
 
@@ -222,10 +222,9 @@ def run_grid(runs: list[Run], args: Args) -> bool:
     import ray
 
     # Nothing is stored in the object store: near the least that Ray takes
-    local = {"num_cpus": args.cores, "object_store_memory": 100_000_000, "include_dashboard": False}
-    options = {"logging_level": "error", "log_to_driver": False, **({} if args.address else local)}
-    try:
-        ray.init(args.address or "local", **options)  # "local" even if RAY_ADDRESS is set
+    local = {} if args.address else {"num_cpus": args.cores, "object_store_memory": 100_000_000}
+    try:  # "local" even if RAY_ADDRESS is set
+        ray.init(args.address or "local", logging_level="error", log_to_driver=False, include_dashboard=False, **local)
     except Exception as error:  # Ray raises bare ones, too
         usage_error(f"--address {args.address}", f"Ray does not start ({(str(error) or repr(error)).splitlines()[0]})")
     stop = StopSignal()
@@ -272,11 +271,13 @@ def main() -> None:
     except ValueError as error:
         usage_error(f"--games {' '.join(args.games)}", error)
     check_args(args)
-    if len(args.seeds) == 1 and args.seeds[0] > 1:
-        print(f"--seeds {args.seeds[0]} is one seed; two would be --seeds 1 2, for example", file=sys.stderr)
     variants = [read_variant(word, args.total_timesteps) for word in dict.fromkeys(args.variants)]
     grid = itertools.product(dict.fromkeys(args.seeds), dict.fromkeys(args.games), variants)  # each once
     runs = [make_run(game, variant, seed, args) for seed, game, variant in grid]
+    for run in runs if args.figures else ():  # now, because the report would refuse it when all are trained
+        record, directory = args.out / "runs" / run.name / "run.json", run.directory()
+        if record.exists() and json.loads(record.read_bytes())["source"] != (directory and directory.name):
+            usage_error(f"--out {args.out}", f"{record.parent} holds a run of another training; give another directory")
     if args.dry_run:
         for run in runs:
             print(f"{run.name}: {run.reason or f'{run.state}, step {run.step:,}'}: {shlex.join(run.command())}")

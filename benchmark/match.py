@@ -11,7 +11,6 @@ The matched variant, and the other at each of `--bounds`, are trained for the fi
 The match is where the mean of the curve, linear in the bound's log, is the matched variant's, for these iterations.
 """
 
-import itertools
 import subprocess
 import sys
 import tempfile
@@ -29,7 +28,6 @@ from benchmark.readme import markdown
 from bookkeeping import NonNegativeInt, PositiveInt, available_cores, check_args
 
 ROOT = Path(__file__).resolve().parent.parent
-
 
 # The matched variant; the tried one, whose --clip-coef is looked for; its symbol; bounds; does the mean rise with them?
 SEARCHES = {
@@ -73,10 +71,10 @@ def mean_over_training(on: str, script: str, *flags: str) -> float:
 def interpolate(bounds: list[float], means: list[float], wanted: float, rises: bool) -> float:
     """Returns the bound at which the mean is `wanted`; NaN if that is beyond the tried ones, or if the means do not
     rise (or fall) with the bounds, which are sorted: noise is larger than the effect then."""
-    sign, means = (1 if rises else -1), np.array(means)
-    if (np.diff(sign * means) <= 0).any():
-        return np.nan
-    return float(np.exp(np.interp(sign * wanted, sign * means, np.log(bounds), left=np.nan, right=np.nan)))
+    sign = 1 if rises else -1
+    means = sign * np.array(means)
+    found = np.exp(np.interp(sign * wanted, means, np.log(bounds), left=np.nan, right=np.nan))
+    return float(found) if (np.diff(means) > 0).all() else np.nan
 
 
 def main() -> None:
@@ -86,17 +84,15 @@ def main() -> None:
     bounds = sorted(args.bounds or bounds)
     variants = [matched, *((*tried, "--clip-coef", str(bound)) for bound in bounds)]
     common = ["--seed", str(args.seed), "--stop-at", str(1024 * args.iterations), *(["--bf16"] if args.bf16 else [])]
-    table, found = [], {}
-    train = lambda pair: mean_over_training(args.on, *pair[1], "--env-id", pair[0], *common)  # noqa: E731
+    calls = [(args.on, *variant, "--env-id", game, *common) for game in args.games for variant in variants]
     with ThreadPoolExecutor(args.jobs) as pool:
-        means = iter(list(pool.map(train, itertools.product(args.games, variants))))
-    for game in args.games:
-        wanted, *of_bounds = itertools.islice(means, len(variants))
-        found[game] = interpolate(bounds, of_bounds, wanted, rises)
-        table.append([game, *(f"{mean:.3g}" for mean in (wanted, *of_bounds)), f"{found[game]:.4f}"])
+        means = list(pool.map(lambda call: mean_over_training(*call), calls))
+    by_game = dict(zip(args.games, np.reshape(means, (-1, len(variants)))))
+    found = {game: interpolate(bounds, of_bounds, wanted, rises) for game, (wanted, *of_bounds) in by_game.items()}
+    table = [[game, *(f"{mean:.3g}" for mean in by_game[game]), f"{found[game]:.4f}"] for game in found]
     names = [f"{symbol} = {bound:g}" for bound in bounds]
     print(markdown(["game", " ".join(matched), *names, f"matching {symbol}"], table))
-    if without := [game for game, bound in found.items() if np.isnan(bound)]:
+    if without := [game for game in found if np.isnan(found[game])]:
         sys.exit(f"{', '.join(without)}: no match between the tried bounds; give other --bounds, or more --iterations")
     print(f"Geometric mean over the games: {symbol} = {np.exp(np.mean(np.log(list(found.values())))):.4f}")
 

@@ -49,8 +49,7 @@ LIMITS = ["float32_gflops", "bfloat16_gflops", "emulator_steps_per_second"]
 FIRST_LAYER = 2 * 20 * 20 * 32 * 256 / 1e6
 FORWARD = FIRST_LAYER + 2 * (9 * 9 * 64 * 512 + 7 * 7 * 64 * 576 + 3136 * 512) / 1e6  # 18.7
 BACKWARD = 2 * FORWARD - FIRST_LAYER  # gradients of weights and of inputs, but not of the screens
-AGENT_STEP = FORWARD + 4 * (FORWARD + BACKWARD)  # 217: the rollout, then four epochs
-KL_PASS = FORWARD  # the scripts look at the rollout once more, peers do not
+AGENT_STEP = 2 * FORWARD + 4 * (FORWARD + BACKWARD)  # 236: the rollout, the pass over it for the KL, four epochs
 
 
 @dataclass
@@ -119,8 +118,10 @@ def make_candidates(args: Args) -> list[Candidate]:
         if "--resume" in flags:
             import torch
 
-            checkpoint = candidates[-1].checkpoint = Path(command[command.index("--resume") + 1]) / "checkpoint.pt"
+            place = command.index("--resume")
+            checkpoint = candidates[-1].checkpoint = Path(command[place + 1]) / "checkpoint.pt"
             candidates[-1].first_step = torch.load(checkpoint, weights_only=True)["global_step"]
+            del command[place : place + 2]
     game = f"{canonical_name(args.env_id)}NoFrameskip-v4"  # as peers name it
     if args.peer:
         name = f"Stable-Baselines3 {importlib.metadata.version('stable-baselines3')}"
@@ -138,22 +139,15 @@ def make_candidates(args: Args) -> list[Candidate]:
 
 
 # ------------------------------------------------------------------------------------------ limits of the processor
-def call_in_process(function, *arguments):
-    """Calls a function in a new process: it may set torch's threads, and its memory does not count as this one's."""
-    with get_context("spawn").Pool(1) as pool:
-        return pool.apply(function, arguments)
-
-
 def probe_convolutions(threads: int, dtype_name: str, seconds: float = 2.0) -> float:
     """Returns the best GFLOP/s of the network's three convolutions, forward and backward on 256 samples."""
     import torch
 
     torch.set_num_threads(threads)
     layout = {"dtype": getattr(torch, dtype_name), "memory_format": torch.channels_last}
-    layers = [torch.nn.Conv2d(*sizes).to(**layout) for sizes in ((4, 32, 8, 4), (32, 64, 4, 2), (64, 64, 3, 1))]
-    network, screens = torch.nn.Sequential(*layers), torch.rand(256, 4, 84, 84).to(**layout)
-    forward = FORWARD - 2 * 3136 * 512 / 1e6
-    best, stop = 0.0, time.perf_counter() + seconds
+    layers = [torch.nn.Conv2d(*sizes) for sizes in ((4, 32, 8, 4), (32, 64, 4, 2), (64, 64, 3, 1))]
+    network, screens = torch.nn.Sequential(*layers).to(**layout), torch.rand(256, 4, 84, 84).to(**layout)
+    forward, best, stop = FORWARD - 2 * 3136 * 512 / 1e6, 0.0, time.perf_counter() + seconds
     while not best or time.perf_counter() < stop:
         start = time.perf_counter()
         output = network(screens)
@@ -194,60 +188,47 @@ def measure(log: pd.DataFrame, start: float, end: float) -> dict[str, float]:
     if len(log) < 2:
         sys.exit("the jobs have no iteration in common after their warm-up: give a longer --window")
     seconds, phases = log["end"].diff()[1:], log.filter(like="time/")[1:]
-    if len(phases.columns):
-        phases["time/unaccounted"] = seconds - phases.sum(axis=1)
     speed = np.ptp(log["step"]) / seconds.sum()
     return {"steps_per_second": speed, "time/iteration": seconds.median(), **phases.median()}
 
 
-def run_process(setting: dict, iterations: int, directory: Path) -> tuple[pd.DataFrame, dict[str, float]]:
-    """Runs one job, and returns its log and the measurements of the whole process."""
+def run_process(setting: dict, iterations: int) -> tuple[pd.DataFrame, float]:
+    """Runs one job; returns its log, and the most MB that its process held."""
     candidate, num_envs, threads, jobs = setting.values()
     last_step = candidate.first_step + num_envs * NUM_STEPS * iterations
     command = [*candidate.command, "--num-envs", str(num_envs), "--total-timesteps", str(last_step)]
-    variables = {**os.environ, "CUDA_VISIBLE_DEVICES": "", **candidate.variables}
-    threads = str(max(1, threads // jobs))
-    if candidate.peer:  # it has no flag for threads, and logs below its working directory
-        variables |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
-    elif candidate.checkpoint:
-        shutil.copy(candidate.checkpoint, directory)
-        command[command.index("--resume") + 1] = str(directory)
-    else:
-        command += ["--log-dir", str(directory)]
-    command += [] if candidate.peer else ["--threads", threads]
-    started, cwd = time.time(), directory if candidate.peer else None
-    child = subprocess.Popen(command, cwd=cwd, env=variables, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode != 0:
-        sys.exit(f"{candidate.name} ended with status {child.returncode}")
-    log = read_log(directory)
-    # At least what this program holds, as Linux counts it: so the probes are other processes
-    peak_mb = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
-    return log, {"peak_mb": peak_mb, "time/first_iteration": log["end"].iloc[0] - started}
+    variables, threads = {**os.environ, "CUDA_VISIBLE_DEVICES": "", **candidate.variables}, str(max(1, threads // jobs))
+    with tempfile.TemporaryDirectory(prefix="throughput-") as directory:
+        if candidate.peer:  # it has no flag for threads, and logs below its working directory
+            variables |= dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), threads)
+        else:
+            command += ["--threads", threads, "--log-dir", directory]
+        if candidate.checkpoint:
+            command += ["--resume", shutil.copy(candidate.checkpoint, directory)]
+        cwd = directory if candidate.peer else None
+        child = subprocess.Popen(command, cwd=cwd, env=variables, stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(child.pid, 0)
+        child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode != 0:
+            sys.exit(f"{candidate.name} ended with status {child.returncode}")
+        # At least what this program holds, as Linux counts it: so the probes are other processes
+        return read_log(Path(directory)), usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e6
 
 
 def run_jobs(setting: dict, args: Args) -> list[dict[str, float]]:
     """Runs all jobs at once. Their speed is measured only while all are past their warm-up and none is done."""
-    num_jobs, iterations = setting["jobs"], args.warmup + args.window
-    with tempfile.TemporaryDirectory(prefix="throughput-") as top, ThreadPoolExecutor(num_jobs) as pool:
-        directories = [Path(tempfile.mkdtemp(dir=top)) for _ in range(num_jobs)]
-        jobs = list(pool.map(lambda directory: run_process(setting, iterations, directory), directories))
+    with ThreadPoolExecutor(setting["jobs"]) as pool:
+        calls = [pool.submit(run_process, setting, args.warmup + args.window) for _ in range(setting["jobs"])]
+    jobs = [call.result() for call in calls]
     start = max(log["end"].iloc[args.warmup - 1] for log, _ in jobs)
     end = min(log["end"].iloc[-1] for log, _ in jobs)
-    return [{**measure(log, start, end), **of_process} for log, of_process in jobs]
+    return [{**measure(log, start, end), "peak_mb": peak_mb} for log, peak_mb in jobs]
 
 
 def add_rows(path: Path, rows: list[dict[str, object]]) -> None:
     """Adds rows to a CSV, and columns that it has not had; cells without a value stay empty."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.open("a").close()
-    known = pd.read_csv(path) if path.stat().st_size else pd.DataFrame({"steps_per_second": []})
-    if "steps_per_second" not in known:
-        usage_error(f"--csv {path}", "it holds other columns than these runs have; give another file")
-    if rows:
-        table = pd.concat([known, pd.DataFrame(rows)]) if len(known) else pd.DataFrame(rows)
-        write_file(path, table.to_csv(index=False, float_format="%.6g", lineterminator="\n"))
+    tables = [*([pd.read_csv(path)] if path.exists() else []), pd.DataFrame(rows)]
+    write_file(path, pd.concat(tables).to_csv(index=False, float_format="%.6g", lineterminator="\n"))
 
 
 # ------------------------------------------------------------------------------------------------------ tables
@@ -260,31 +241,30 @@ def make_tables(processes: pd.DataFrame, peers: list[str]) -> list[str]:
     """Returns the tables of speed, phases and limits.
 
     Speeds are compared with the first row, and with each peer at the same setting. Phases are milliseconds and shares
-    of an iteration: medians, which need not add up; peers log none. Limits are shares, and what these are of.
+    of an iteration: medians, which need not add up. Limits are shares, and what these are of. Both are the scripts'.
     """
     speeds = processes.groupby([*ROW, "round"], sort=False)["steps_per_second"].sum().unstack()  # all jobs together
-    phases = processes.filter(like="time/").columns.drop(["time/iteration", "time/first_iteration"])
+    phases = processes.filter(like="time/").columns.drop("time/iteration")
     speed_table, phase_table, limits_table = [], [], []
     for row, own in processes.groupby(ROW, sort=False):
         speed, label, iteration = speeds.loc[row], [*map(str, row)], own["time/iteration"]
         others = [tuple(processes[ROW].iloc[0]), *((peer, *row[1:]) for peer in peers)]
         ratios = ["–" if row == other else spread(speed / speeds.loc[other], 2) for other in others]
-        process = [spread(own["peak_mb"]), spread(own["time/first_iteration"], 1)]
-        speed_table.append([*label, spread(speed), *ratios, *process])
-        if row[0] not in peers:
-            shares = (own[phases].div(iteration, axis=0)).median()
-            cells = [f"{1000 * own[phase].median():.0f} ({shares[phase]:.1%})" for phase in phases]
-            phase_table.append([*label, f"{1000 * iteration.median():.0f}", *cells])
+        speed_table.append([*label, spread(speed), *ratios, spread(own["peak_mb"])])
+        if row[0] in peers:
+            continue
+        shares = own[phases].div(iteration, axis=0).median()
+        cells = [f"{1000 * own[phase].median():.0f} ({shares[phase]:.1%})" for phase in phases]
+        phase_table.append([*label, f"{1000 * iteration.median():.0f}", *cells])
         if LIMITS[0] in own:
             *gflops, emulator = own[LIMITS].iloc[0]
-            network = [1000 * limit / (AGENT_STEP + (0 if row[0] in peers else KL_PASS)) for limit in gflops]
+            network = [1000 * limit / AGENT_STEP for limit in gflops]
             limits = [*network, emulator, *(1 / (1 / limit + 1 / emulator) for limit in network)]
             limits_table.append([*label, *(f"{speed.median() / limit:.0%} of {limit:,.0f}" for limit in limits)])
+    speed_names = ["steps/s", "× first row", *(f"× {peer}" for peer in peers), "peak MB a process"]
+    phase_names = ["iteration, ms", *phases.str.removeprefix("time/")]
     bounds = ["float32 convolutions", "bfloat16 convolutions", "bare emulator"]
     bounds += [f"{bound} and emulator in turn" for bound in bounds[:2]]
-    ratio_names = ["× first row", *(f"× {peer}" for peer in peers)]
-    speed_names = ["steps/s", *ratio_names, "peak MB a process", "first iteration after, s"]
-    phase_names = ["iteration, ms", *phases.str.removeprefix("time/")]
     tables = [(speed_names, speed_table), (phase_names, phase_table), (bounds, limits_table)]
     return [markdown([*ROW, *names], table) for names, table in tables if table]
 
@@ -293,26 +273,25 @@ def main() -> None:
     args = tyro.cli(Args, description=__doc__)
     check_args(args)
     candidates = make_candidates(args)
-    add_rows(args.csv, [])  # refused now if it cannot be written
+    args.csv.parent.mkdir(parents=True, exist_ok=True)
     # The candidates of one setting follow each other, so that the closest comparisons are closest in time
     products = itertools.product(args.num_envs, args.threads, args.jobs, candidates)
     settings = [dict(zip(ROW, (candidate, *numbers))) for *numbers, candidate in products]
     cpuinfo = Path("/proc/cpuinfo").read_text(encoding="utf-8") if sys.platform == "linux" else ""
     cpu = (re.findall(r"model name\s*: (.*)", cpuinfo) or ["unknown processor"])[0]
     call = {"call": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()), "env_id": args.env_id, "cpu": cpu}
-    call |= {"kind": call_in_process(processor_kind), "warmup": args.warmup, "window": args.window}
-
     rom, _ = find_atari_game(args.env_id) or ("", 0.0)
     limits, processes = {}, []
-    for num_envs, threads in itertools.product(args.num_envs, args.threads) if rom else ():
-        gflops = [call_in_process(probe_convolutions, threads, dtype) for dtype in ("float32", "bfloat16")]
-        limits[num_envs, threads] = dict(
-            zip(LIMITS, [*gflops, call_in_process(probe_emulator, rom, num_envs, threads)])
-        )
+    # A process each: a probe sets torch's threads, and its memory is not to count as this program's
+    with get_context("spawn").Pool(1, maxtasksperchild=1) as pool:
+        call |= {"kind": pool.apply(processor_kind), "warmup": args.warmup, "window": args.window}
+        for num_envs, threads in itertools.product(args.num_envs, args.threads) if rom else ():
+            gflops = [pool.apply(probe_convolutions, (threads, dtype)) for dtype in ("float32", "bfloat16")]
+            limits[num_envs, threads] = [*gflops, pool.apply(probe_emulator, (rom, num_envs, threads))]
     for number, setting in itertools.product(range(1, args.rounds + 1), settings):
         candidate = setting["candidate"]
         about = {**call, "commit": candidate.commit, "torch": candidate.torch, **setting, "candidate": candidate.name}
-        about |= {"round": number, **limits.get((setting["num_envs"], setting["threads"]), {})}
+        about |= {"round": number, **dict(zip(LIMITS, limits.get((setting["num_envs"], setting["threads"]), ())))}
         rows = [{**about, **job} for job in run_jobs(setting, args)]
         add_rows(args.csv, rows)
         processes += rows

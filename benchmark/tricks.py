@@ -6,12 +6,12 @@ Prints a table: milliseconds of each form (median) and the median of the pairwis
 those of the thesis: minibatches of 256 screens for the update, 8 screens for a step of the rollout. Takes a minute.
 """
 
-import copy
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median, quantiles
 
@@ -41,13 +41,14 @@ class Args:
     """time that one measurement repeats its form for, at least once"""
 
 
-def nature_cnn(convolve_last: bool = False, inplace: bool = True) -> nn.Sequential:
+def nature_cnn(layout=torch.channels_last, dtype=torch.float32, convolve_last=False, inplace=True) -> nn.Sequential:
     """The Nature CNN with a head of logits and a value; the 512-unit layer as a `Linear` or as a 7×7 convolution."""
     torch.manual_seed(1)
     wide = [nn.Conv2d(64, 512, 7), nn.Flatten()] if convolve_last else [nn.Flatten(), nn.Linear(3136, 512)]
     layers = [nn.Conv2d(4, 32, 8, 4), nn.Conv2d(32, 64, 4, 2), nn.Conv2d(64, 64, 3)]
     layers = [part for layer in layers for part in (layer, nn.ReLU(inplace))]
-    return nn.Sequential(*layers, *wide, nn.ReLU(inplace), nn.Linear(512, NUM_ACTIONS + 1))
+    network = nn.Sequential(*layers, *wide, nn.ReLU(inplace), nn.Linear(512, NUM_ACTIONS + 1))
+    return network.to(memory_format=layout, dtype=dtype)
 
 
 def update(network: nn.Module, screens: torch.Tensor, dtype: torch.dtype = torch.float32, bf16=False) -> Callable:
@@ -62,34 +63,27 @@ def update(network: nn.Module, screens: torch.Tensor, dtype: torch.dtype = torch
     return run
 
 
-def optimizer_step(fused: bool) -> Callable:
-    network = nature_cnn()
-    network(torch.rand(2, 4, 84, 84)).sum().backward()
-    return torch.optim.Adam(network.parameters(), lr=1e-9, fused=fused).step
-
-
-def late_optimizer_step(flush: bool) -> Callable:
-    """Returns gradient clipping and a step of Adam as late in a run: an eighth of the first moments is denormal.
+def optimizer_step(fused: bool = True, late: bool = False, flush: bool = False) -> Callable:
+    """Returns a step of Adam; `late` in a run, gradient clipping and a step with an eighth of the moments denormal.
 
     Those belong to dead units. They are 4 units of the last place, which 0.9 times 4 is rounded to again. Runs in a
     thread of its own, because the setting belongs to a thread and to those that it starts.
     """
-    network, thread = nature_cnn(), ThreadPoolExecutor(1, initializer=torch.set_flush_denormal, initargs=(flush,))
-    optimizer = torch.optim.Adam(network.parameters(), lr=1e-9, fused=True)
-
-    def prepare():
-        network(torch.rand(2, 4, 84, 84)).sum().backward()
-        optimizer.step()
-        for parameter in network.parameters():
-            dead = parameter.numel() // 8
-            parameter.grad.view(-1)[:dead] = 0
-            optimizer.state[parameter]["exp_avg"].view(-1)[:dead] = 4 * 2.0**-149
+    network = nature_cnn(torch.contiguous_format)
+    thread = ThreadPoolExecutor(1, initializer=torch.set_flush_denormal, initargs=(flush,))
+    optimizer = torch.optim.Adam(network.parameters(), lr=1e-9, fused=fused)
 
     def run():
-        nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+        if late:
+            nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         optimizer.step()
 
-    thread.submit(prepare).result()
+    network(torch.rand(2, 4, 84, 84)).sum().backward()
+    thread.submit(run).result()
+    for parameter in network.parameters() if late else ():
+        dead = parameter.numel() // 8
+        parameter.grad.view(-1)[:dead] = 0
+        optimizer.state[parameter]["exp_avg"].view(-1)[:dead] = 4 * 2.0**-149
     return lambda: thread.submit(run).result()
 
 
@@ -108,8 +102,7 @@ def rollout_step(num_threads: int, groups: int = 1, **options) -> Callable:
 
     `num_threads` and `options` are ale-py's.
     """
-    network = nature_cnn().to(memory_format=torch.channels_last)
-    size = NUM_ENVS // groups
+    network, size = nature_cnn(), NUM_ENVS // groups
     options = {"num_threads": max(1, num_threads // groups), "use_fire_reset": False, **options}
     games = [AtariVectorEnv("breakout", size, **options) for _ in range(groups)]
     for envs in games:
@@ -133,26 +126,25 @@ def tricks(threads: int) -> dict[str, tuple[Callable, Callable]]:
     chosen = torch.randperm(4 * MINIBATCH)[:MINIBATCH]
     last = nhwc[:MINIBATCH].movedim(-1, 1)  # (B, 4, 84, 84) in channels-last layout
     first = last.contiguous()  # the same in torch's default layout
-    channels_last = nature_cnn().to(memory_format=torch.channels_last)
-    convolved = nature_cnn(convolve_last=True).to(memory_format=torch.channels_last)
-    out_of_place = nature_cnn(inplace=False).to(memory_format=torch.channels_last)
+    network, late_step = nature_cnn(), partial(optimizer_step, late=True)
+    usual = update(network, last)
     few, logits, rollout = last[:NUM_ENVS], torch.randn(NUM_ENVS, NUM_ACTIONS), rollout_step(threads)
     return {
-        "update: channels-last layout": (update(nature_cnn(), first), update(channels_last, last)),
-        "update: 512-unit layer as a 7×7 convolution (refused)": (update(channels_last, last), update(convolved, last)),
-        "update: ReLU in place": (update(out_of_place, last), update(channels_last, last)),
-        "update: fused Adam": (optimizer_step(fused=False), optimizer_step(fused=True)),
-        "update: denormal numbers flushed to 0, late in a run": (late_optimizer_step(False), late_optimizer_step(True)),
+        "update: channels-last layout": (update(nature_cnn(torch.contiguous_format), first), usual),
+        "update: 512-unit layer as a 7×7 convolution (refused)": (usual, update(nature_cnn(convolve_last=True), last)),
+        "update: ReLU in place": (update(nature_cnn(inplace=False), last), usual),
+        "update: fused Adam": (optimizer_step(fused=False), optimizer_step()),
+        "update: denormal numbers flushed to 0, late in a run": (late_step(flush=False), late_step(flush=True)),
         "minibatch: index_select for obs[indices]": (lambda: nhwc[chosen], lambda: nhwc.index_select(0, chosen)),
         "minibatch: .float().div_(255) for / 255": (lambda: last / 255.0, lambda: last.float().div_(255.0)),
         "update, bfloat16: screens cast to it at once, not by way of float32": (
-            update(channels_last, last, torch.float32, bf16=True),
-            update(channels_last, last, torch.bfloat16, bf16=True),
+            update(network, last, torch.float32, bf16=True),
+            update(network, last, torch.bfloat16, bf16=True),
         ),
-        "rollout: inference_mode": (forward(channels_last, few, torch.no_grad), forward(channels_last, few)),
+        "rollout: inference_mode": (forward(network, few, torch.no_grad), forward(network, few)),
         "rollout, bfloat16: weights cast once, not at each step": (
-            forward(channels_last, few, bf16=True),
-            forward(copy.deepcopy(channels_last).bfloat16(), few, bf16=True),
+            forward(network, few, bf16=True),
+            forward(nature_cnn(dtype=torch.bfloat16), few, bf16=True),
         ),
         "rollout: multinomial for Categorical": (
             lambda: Categorical(logits=logits).sample(),

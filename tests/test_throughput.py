@@ -1,6 +1,5 @@
 """The speed measurements: how the numbers are read, their tables, and one call as a user makes it."""
 
-import subprocess
 import sys
 
 import pandas as pd
@@ -11,16 +10,17 @@ from torch.utils.tensorboard import SummaryWriter
 
 import acppo_atari
 import bookkeeping
+import ppo_atari
 from benchmark import throughput
-from conftest import ROOT
+from conftest import ROOT, train
 
 
 def processes(name: str, *rounds: list[float], **columns) -> pd.DataFrame:
     """Returns processes of a candidate whose jobs ran at these steps/s, round by round."""
     setting = {"candidate": name, "num_envs": 8, "threads": 2, "jobs": len(rounds[0]), "peak_mb": 500}
-    seconds = {"time/first_iteration": 5, "time/iteration": 4}
     speeds = [(number, speed) for number, jobs in enumerate(rounds) for speed in jobs]
-    return pd.DataFrame([{**setting, **seconds, **columns, "round": n, "steps_per_second": v} for n, v in speeds])
+    columns = {**setting, "time/iteration": 4, **columns}
+    return pd.DataFrame([{**columns, "round": number, "steps_per_second": speed} for number, speed in speeds])
 
 
 def log_iterations(directory, ends: list[float], phases: dict[str, list[float]]) -> pd.DataFrame:
@@ -60,22 +60,20 @@ def test_speed_and_phases_are_those_of_the_window(tmp_path):
         "time/environment": 0.5,
         "time/update": 1.5,
         "time/any other": 0,
-        "time/unaccounted": 0.5,  # of 0.5, 0.25 and 1
     }
 
 
 def test_peer_logs_no_phases_and_has_no_row_of_them(tmp_path):
     run = throughput.measure(log_iterations(tmp_path, [1000, 1004], {}), start=1000, end=1004)
     assert run == {"steps_per_second": 250, "time/iteration": 4}
-    rows = [processes("script", [800], **{"time/update": 3, "time/unaccounted": 0.25}), processes("peer", [400])]
+    rows = [processes("script", [800], **{"time/update": 3, "time/rest": 0.25}), processes("peer", [400])]
     header, _, line = cells(throughput.make_tables(pd.concat(rows), peers=["peer"])[1])
-    assert header[4:] == ["iteration, ms", "update", "unaccounted"]
+    assert header[4:] == ["iteration, ms", "update", "rest"]
     assert line[0] == "script" and line[4:] == ["4000", "3000 (75.0%)", "250 (6.2%)"]
 
 
 def test_limits_are_shared_out_as_agent_steps():
-    gflops = (throughput.AGENT_STEP + throughput.KL_PASS) / 1000  # of one agent step
-    limits = dict(zip(throughput.LIMITS, (1600 * gflops, 3200 * gflops, 4800)))
+    limits = dict(zip(throughput.LIMITS, (1.6 * throughput.AGENT_STEP, 3.2 * throughput.AGENT_STEP, 4800)))
     shown = cells(throughput.make_tables(processes("script", [800], **limits), peers=[])[2])[2]
     assert shown[4:] == ["50% of 1,600", "25% of 3,200", "17% of 4,800", "67% of 1,200", "42% of 1,920"]
 
@@ -97,21 +95,21 @@ def test_probes_give_a_speed():
 
 
 def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatch, capfd):
-    results = tmp_path / "made" / "throughput.csv"
-    flags = ["acppo_atari.py --c 0", "--env-id", "CartPole-v1", "--csv", str(results)]
-    flags += "--rounds 1 --warmup 1 --window 3 --num-envs 2 --threads 2".split()
+    names, csv = ["acppo_atari.py --c 0", f"ppo_atari.py --resume {tmp_path}"], tmp_path / "made" / "throughput.csv"
+    train(ppo_atari, tmp_path, env_id="CartPole-v1", num_envs=2, num_steps=128, total_timesteps=256)
+    saved = (tmp_path / "checkpoint.pt").read_bytes()
+    flags = "--env-id CartPole-v1 --rounds 1 --warmup 1 --window 3 --num-envs 2 --threads 2".split()
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags])
+    monkeypatch.setattr(sys, "argv", ["throughput.py", *names, *flags, "--csv", str(csv)])
     throughput.main()
+    assert (tmp_path / "checkpoint.pt").read_bytes() == saved  # a copy is resumed
     tables = [cells(block) for block in capfd.readouterr().out.split("\n\n") if block.startswith("|")]
-    assert [len(table) for table in tables] == [3, 3]  # speed and phases; no limits outside Atari
-    assert all(table[2][:4] == ["acppo_atari.py --c 0", "2", "2", "1"] for table in tables)
-    rows = pd.read_csv(results)
-    assert len(rows) == 1 and set(rows["candidate"]) == {"acppo_atari.py --c 0"}
-    assert tables[0][2][4].startswith(f"{rows['steps_per_second'][0]:,.0f} (")
+    assert len(tables) == 2  # speed and phases; no limits outside Atari
+    assert all([line[:4] for line in table[2:]] == [[name, "2", "2", "1"] for name in names] for table in tables)
+    rows = pd.read_csv(csv)
+    assert list(rows.candidate) == names and tables[0][2][4].startswith(f"{rows.steps_per_second[0]:,.0f} (")
     assert rows["peak_mb"].between(50, 5000).all()  # an interpreter with torch, and no more
-    work = ("inference", "environment", "update", "kl_pass", "first_iteration")
-    assert (rows[[f"time/{name}" for name in work]] > 0).all(axis=None)
+    assert (rows[[f"time/{name}" for name in ("inference", "environment", "update", "kl_pass")]] > 0).all(axis=None)
     assert rows["kind"][0] == bookkeeping.processor_kind() and rows[["cpu", "commit", "torch"]].notna().all(axis=None)
 
 
@@ -124,18 +122,6 @@ def test_rows_with_other_phases_are_added_and_known_ones_stay(tmp_path):
     assert rows == ["a,1,0.333333,0.5,", '"b, c",2,2,,0.25']
 
 
-def test_candidate_s_commit_is_that_of_its_own_checkout(tmp_path, monkeypatch):
-    def git(*words: str) -> str:
-        settings = "-c user.name=a -c user.email=b -c commit.gpgsign=no".split()
-        return subprocess.run(["git", *settings, *words], check=True, capture_output=True, text=True).stdout.strip()
-
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "script.py").touch()
-    any(git(*words.split()) for words in ("init --quiet", "add script.py", "commit --quiet --message=one"))
-    (candidate,) = throughput.make_candidates(throughput.Args(candidates=("script.py",)))
-    assert candidate.commit == git("rev-parse", "HEAD")
-
-
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
@@ -146,13 +132,12 @@ def test_candidate_s_commit_is_that_of_its_own_checkout(tmp_path, monkeypatch):
         (["script.py", "--window", "0"], "--window 0: give "),
         (["script.py", "--env-id", "ALE/Breakout-v5", "--peer"], "a game such as Breakout"),
         (["script.py", "--cleanrl", "."], "there is no cleanrl/ppo_atari.py in it"),
-        (["script.py", "--csv", "script.py"], "it holds other columns"),
     ],
 )
 def test_bad_input_is_refused_and_leaves_nothing(flags, said, tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "script.py").write_text("a,script,that,is,never,started\n")
-    monkeypatch.setattr(sys, "argv", ["throughput.py", *(flags if "--csv" in flags else [*flags, "--csv", "x.csv"])])
+    (tmp_path / "script.py").touch()
+    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags, "--csv", "x.csv"])
     with pytest.raises(SystemExit) as exit_:
         throughput.main()
     assert exit_.value.code == 2 and said in capfd.readouterr().err
@@ -167,4 +152,4 @@ def test_failing_process_ends_the_call_and_rows_before_it_stay(tmp_path, monkeyp
     monkeypatch.setattr(sys, "argv", "x script.py script.py --env-id CartPole-v1 --csv x.csv".split())
     with pytest.raises(SystemExit, match=r"\(2\) ended with status 3"):
         throughput.main()
-    assert len(pd.read_csv("x.csv")) == 1
+    assert list(pd.read_csv("x.csv").commit) == ["unknown"]  # of the script's directory, which is no checkout

@@ -4,7 +4,6 @@ import math
 import subprocess
 import sys
 
-import numpy as np
 import pytest
 
 from benchmark import match
@@ -24,20 +23,18 @@ def call(monkeypatch, capfd):
     return call_main
 
 
-def test_interpolation_is_linear_in_the_log_of_the_bound():
-    find = lambda means, rises: match.interpolate([0.01, 0.1, 1.0], means, 0.25, rises)  # noqa: E731
-    assert find([0.3, 0.2, 0.0], rises=False) == pytest.approx(0.1 / math.sqrt(10))
-    assert find([0, 0.2, 0.3], rises=True) == pytest.approx(0.1 * math.sqrt(10))
-
-
-def test_match_is_not_found_beyond_the_bounds_or_among_noise():
-    for means, wanted in (([0.3, 0.0], 0.31), ([0.3, 0.0], -0.01), ([0.1, 0.3], 0.2)):
-        assert np.isnan(match.interpolate([0.01, 1.0], means, wanted, rises=False))
-
-
-@pytest.mark.parametrize("flags", ["--on entropy", "--on kl --bounds 0.1", "--on kl --iterations 0"])
-def test_impossible_arguments_are_refused(flags, call):
-    assert call(*flags.split())[0] == 2
+@pytest.mark.parametrize(
+    ("means", "wanted", "rises", "found"),
+    [
+        ([0.3, 0.2, 0.0], 0.25, False, 0.1 / math.sqrt(10)),  # linear in the bound's log
+        ([0.0, 0.2, 0.3], 0.25, True, 0.1 * math.sqrt(10)),
+        ([0.3, 0.2, 0.0], 0.31, False, math.nan),  # beyond the bounds
+        ([0.3, 0.2, 0.0], -0.01, False, math.nan),
+        ([0.3, 0.1, 0.2], 0.25, False, math.nan),  # noise
+    ],
+)
+def test_interpolation_finds_a_match_if_there_is_one(means, wanted, rises, found):
+    assert match.interpolate([0.01, 0.1, 1.0], means, wanted, rises) == pytest.approx(found, nan_ok=True)
 
 
 @pytest.mark.parametrize("on", ["clipfrac", "kl"])
@@ -46,25 +43,22 @@ def test_search_trains_matched_variant_and_the_other_at_each_bound(on, call, mon
 
     def train(curve, *command):
         assert curve == on and "--bf16" in command and "--stop-at 3072" in " ".join(command)
-        if (words := command[: command.index("--env-id")]) == matched:
-            return 0.2
+        if (words := command[: command.index("--env-id")]) == matched or "Qbert" in command:
+            return 0.2  # at each bound of Qbert, too: it has no match
         assert words[:-1] == (*tried, "--clip-coef")
         return 0.2 + (1 if rises else -1) * math.log(float(words[-1]) / 0.05)
 
     monkeypatch.setattr(match, "mean_over_training", train)
-    status, out, _ = call("--on", on, "--games", "Pong", *"--iterations 3 --bounds 0.06 0.04 --bf16".split())
+    flags = ("--on", on, *"--iterations 3 --bounds 0.06 0.04 --bf16 --games Pong".split())
+    status, out, _ = call(*flags)
     assert status == 0 and out.splitlines()[2].endswith("| 0.0500 |") and out.endswith(" = 0.0500\n")
+    status, out, _ = call(*flags, "Qbert")
+    assert status.startswith("Qbert: no match between the tried bounds") and "| Qbert | 0.2 | 0.2 | 0.2 | nan |" in out
 
 
-def test_game_without_a_match_is_named(call, monkeypatch):
-    monkeypatch.setattr(match, "mean_over_training", lambda on, *command: 0.9 if "--c" in command else 0.2)
-    status, out, _ = call("--on", "clipfrac", "--games", "Pong", "--bounds", "0.1", "0.2")
-    assert status.startswith("Pong: no match between the tried bounds") and "| Pong | 0.2 | 0.9 | 0.9 | nan |" in out
-
-
-def test_failing_script_ends_the_search(call, monkeypatch, tmp_path):
-    for script in ("ppo_atari.py", "acppo_atari.py"):
-        (tmp_path / script).write_text("import sys; sys.exit(3)")
+def test_one_bound_is_refused_and_a_failing_script_ends_the_search(call, monkeypatch, tmp_path):
+    assert call("--on", "kl", "--bounds", "0.1")[0] == 2
+    (tmp_path / "acppo_atari.py").write_text("import sys; sys.exit(3)")
     monkeypatch.setattr(match, "ROOT", tmp_path)
     with pytest.raises(subprocess.CalledProcessError, match="status 3"):
         call("--on", "kl")

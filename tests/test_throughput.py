@@ -95,9 +95,10 @@ def test_probes_give_a_speed():
 
 
 def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatch, capfd):
-    names, csv = ["acppo_atari.py --c 0", f"ppo_atari.py --resume {tmp_path}"], tmp_path / "made" / "throughput.csv"
+    names, csv = ["acppo_atari.py --c 0", f"ppo_atari.py --resume {tmp_path}"], tmp_path / "throughput.csv"
     train(ppo_atari, tmp_path, env_id="CartPole-v1", num_envs=2, num_steps=128, total_timesteps=256)
     saved = (tmp_path / "checkpoint.pt").read_bytes()
+    throughput.add_rows(csv, [{"candidate": "older, with phases of its own", "time/storage": 0.5}])
     flags = "--env-id CartPole-v1 --rounds 1 --warmup 1 --window 3 --num-envs 2 --threads 2".split()
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(sys, "argv", ["throughput.py", *names, *flags, "--csv", str(csv)])
@@ -106,20 +107,12 @@ def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatc
     tables = [cells(block) for block in capfd.readouterr().out.split("\n\n") if block.startswith("|")]
     assert len(tables) == 2  # speed and phases; no limits outside Atari
     assert all([line[:4] for line in table[2:]] == [[name, "2", "2", "1"] for name in names] for table in tables)
-    rows = pd.read_csv(csv)
+    older, rows = (table := pd.read_csv(csv))[:1].dropna(axis=1), table[1:].reset_index()
+    assert older.to_dict("list") == {"candidate": ["older, with phases of its own"], "time/storage": [0.5]}
     assert list(rows.candidate) == names and tables[0][2][4].startswith(f"{rows.steps_per_second[0]:,.0f} (")
     assert rows["peak_mb"].between(50, 5000).all()  # an interpreter with torch, and no more
     assert (rows[[f"time/{name}" for name in ("inference", "environment", "update", "kl_pass")]] > 0).all(axis=None)
     assert rows["kind"][0] == bookkeeping.processor_kind() and rows[["cpu", "commit", "torch"]].notna().all(axis=None)
-
-
-def test_rows_with_other_phases_are_added_and_known_ones_stay(tmp_path):
-    path = tmp_path / "throughput.csv"
-    throughput.add_rows(path, [{"candidate": "a", "round": 1, "steps_per_second": 1 / 3, "time/storage": 0.5}])
-    throughput.add_rows(path, [{"candidate": "b, c", "round": 2, "steps_per_second": 2.0, "time/rest": 0.25}])
-    header, *rows = path.read_text().splitlines()
-    assert header == "candidate,round,steps_per_second,time/storage,time/rest"
-    assert rows == ["a,1,0.333333,0.5,", '"b, c",2,2,,0.25']
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ import json
 import math
 import os
 import platform
+import random
 import re
 import shlex
 import signal
@@ -40,7 +41,7 @@ import numpy as np
 import tyro
 from gymnasium.vector import VectorEnv
 
-from wrappers import canonical_name, env_seeds, make_envs
+from wrappers import EnvironmentFailed, canonical_name, env_seeds, make_envs
 
 Policy = Callable[[np.ndarray], np.ndarray]  # observations (N, …) → actions (N,)
 PER_CALL_ARGS = {"resume", "evaluate", "stop_at"}  # a run does not keep these
@@ -263,6 +264,7 @@ class RunDirectory:
         self.writer = None  # of TensorBoard's event file
         self.write_errors: set[str] = set()  # what could not be written
         self.iteration = 0  # of the last checkpoint
+        self.learner, self.logged_step = None, 0  # agent and optimizer, and the agent step that they are as after
         self.num_starts = 0  # before this one; each start of a run plays other games
         self.last_scores = deque(maxlen=100)  # raw returns of whole games
         self.checkpoint_due = 0.0
@@ -272,12 +274,12 @@ class RunDirectory:
         self.lock.release()
 
     @classmethod
-    def make(cls, args) -> "RunDirectory":
+    def make(cls, args, start_directory: str = ".") -> "RunDirectory":
         """Makes a new run's directory in `args.log_dir`. If its name is taken, it gets that of the next second."""
         name = re.sub(r"[^\w.-]", "-", canonical_name(args.env_id))
         try:
             for second in itertools.count(int(time.time())):
-                path = os.path.join(args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
+                path = os.path.join(start_directory, args.log_dir, f"{name}__{args.exp_name}__{args.seed}__{second}")
                 with contextlib.suppress(FileExistsError):
                     os.makedirs(path)
                     return cls(path)
@@ -343,9 +345,11 @@ class RunDirectory:
             self.num_starts = state["num_starts"]
             self.last_scores.extend(state["last_scores"])
             with self.reporting("the event file"):
-                for name, size in self.event_files().items():
-                    os.truncate(os.path.join(self.path, name), min(size, state["event_files"].get(name, 0)))
-        self.describe(args, self.iteration * args.batch_size)
+                sizes = self.event_files()  # the checkpoint names all of the run's: each start writes one at once
+                for name in state["event_files"].keys() & sizes.keys():
+                    os.truncate(os.path.join(self.path, name), min(sizes[name], state["event_files"][name]))
+        self.learner, self.logged_step = (agent, optimizer), self.iteration * args.batch_size
+        self.describe(args, self.logged_step)
         return self.iteration
 
     def describe(self, args, step: int) -> None:
@@ -368,6 +372,7 @@ class RunDirectory:
 
     def log(self, step: int, scalars: dict[str, float], games: list[tuple[int, float, int]] = ()) -> None:
         """Writes scalars at an agent step, and games as (agent step, score, length) at the steps where they ended."""
+        self.logged_step = step
         self.last_scores.extend(score for _, score, _ in games)
         mean = {"charts/mean_return_100": np.mean(self.last_scores)} if self.last_scores else {}
         points = [("charts/episodic_return", score, end) for end, score, _ in games]
@@ -434,11 +439,11 @@ class RunDirectory:
         return time.perf_counter() >= self.checkpoint_due
 
     @contextlib.contextmanager
-    def reporting(self, what: str) -> Iterator[None]:
-        """Says once that `what` cannot be written, and carries on."""
+    def reporting(self, what: str, *others: type[Exception]) -> Iterator[None]:
+        """Says once that `what` cannot be written, at an OSError or another of these, and carries on."""
         try:
             yield
-        except OSError as error:
+        except (OSError, *others) as error:
             if what not in self.write_errors:
                 print_message(f"{self.path}: {what} cannot be written ({error}); carrying on without")
             self.write_errors.add(what)
@@ -492,16 +497,24 @@ class StopSignal:
     that is ignored when the script starts stays ignored, as after `nohup`.
     """
 
-    number = 0
+    def __init__(self):
+        self.number, self.process, self.awaited = 0, os.getpid(), []
 
     def listen(self) -> None:
-        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)  # Windows has no SIGHUP
-            if number is not None and signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, self.note)
+        numbers = (getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP"))  # Windows has no SIGHUP
+        self.awaited = [n for n in numbers if n is not None and signal.getsignal(n) != signal.SIG_IGN]
+        self.listen_again()
+
+    def listen_again(self) -> None:
+        """Takes back the signals for which a library in an environment has set a handler."""
+        for number in self.awaited:
+            signal.signal(number, self.note)
 
     def note(self, number: int, frame: object) -> None:
-        if not self.number:
+        if os.getpid() != self.process:  # a child that an environment has forked
+            signal.signal(number, signal.SIG_DFL)
+            os.kill(os.getpid(), number)
+        elif not self.number:
             self.number, self.since = number, time.monotonic()
             print_message("Stopping cleanly; another signal, at least a second from now, ends at once")
         elif time.monotonic() - self.since >= 1:
@@ -560,6 +573,7 @@ def play(
     """
     stop = stop or StopSignal()
     obs, _ = envs.reset(seed=env_seeds(seed, envs.num_envs))
+    stop.listen_again()
     games = [[] for _ in range(envs.num_envs)]
     # Environment n plays the games n, n + N, n + 2N, … of all
     shares = [len(range(n, num_games, envs.num_envs)) for n in range(envs.num_envs)]
@@ -597,7 +611,7 @@ def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSigna
 def record_game(args, policy: Policy, run: RunDirectory, step: int, stop: StopSignal) -> None:
     """Plays one game into `videos/` of the run, with its score in the file's name; none if `stop` notes a signal."""
     path = os.path.join(run.path, "videos", f"step_{step}")
-    with run.reporting("the video"):
+    with run.reporting("the video", EnvironmentFailed, ValueError):  # the latter if it cannot be built once more
         os.makedirs(os.path.dirname(path), exist_ok=True)
         try:
             with contextlib.closing(make_envs(args.env_id, 1, args.threads, video=path + ".mp4")) as envs:
@@ -650,13 +664,18 @@ def open_run(args_class: type, description: str):
         done = f"{run.path} is finished up to {limit}, at step {state['global_step']}"
         print_message(f"{done}; a larger one takes it further, and --evaluate plays games", descriptor=1)
         sys.exit()
-    try:  # an evaluation has its own; of these it takes the spaces
-        envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
+    start_directory = os.getcwd()  # which an environment may leave
+    random.seed(args.seed)  # for environments that draw from these
+    np.random.seed(args.seed % 2**32)
+    try:
         if args.capture_video:
             make_envs(args.env_id, 1, video="none yet").close()  # refused now, if it cannot be rendered
+        envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
+        if args.evaluate is not None:
+            envs.close()  # it has told its spaces; the evaluation builds its own, and some can only exist once
     except ValueError as error:
         usage_error(as_flag("env_id", args.env_id), error)
-    run = run or RunDirectory.make(args)  # last, so that nothing refused above leaves one behind
+    run = run or RunDirectory.make(args, start_directory)  # last, so that nothing refused above leaves one behind
     emulated = args.bf16 and processor_kind() not in ("AMX", "AVX512-BF16", "ARM-BF16")
     if emulated and not (args.cuda and torch.cuda.is_available()):
         print_message("--bf16: this processor has no bfloat16 instructions; expect a tenth of float32's speed")
@@ -664,6 +683,23 @@ def open_run(args_class: type, description: str):
         first, last = (state["global_step"] if state else 0), args.last_iteration * args.batch_size
         print_message(f"{run.path}: from step {first:,} to {last:,}")
     return args, envs, run, state, stop
+
+
+@contextlib.contextmanager
+def ending_in_one_line(args, run: RunDirectory, stop: StopSignal) -> Iterator[None]:
+    """Ends a run whose numbers are not finite, or whose environment fails, which costs it no whole iteration."""
+    try:
+        yield
+    except FloatingPointError as error:
+        print_message(f"{run.path}: {error}")
+        sys.exit(1)
+    except EnvironmentFailed as error:
+        print_message(f"{args.env_id} failed with {' '.join(str(error).split())}")
+        if run.learner is not None:  # since the last update, which is logged, nothing has changed the parameters
+            run.save(args, run.logged_step // args.batch_size, *run.learner)
+        how = "--evaluate" if args.evaluate is not None or run.iteration == args.num_iterations else "--resume"
+        print_message(f"Stopped; continue with: {call_command(args, how, run.path)}")
+        sys.exit(128 + stop.number if stop.number else 1)
 
 
 def finish(args, fresh_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:

@@ -15,7 +15,6 @@ Sections: arguments, network, mathematics, training, command line.
 
 import copy
 import math
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -321,6 +320,7 @@ def train(
     # Storage: T steps of N environments. Row T follows them: its observations begin the next rollout.
     T, N = args.num_steps, args.num_envs
     next_obs, _ = envs.reset(seed=env_seeds(args.seed, N, run.num_starts))
+    stop.listen_again()  # now that environments have been built, which may take signals for themselves
     first_obs = from_envs(next_obs, device)
     obs = torch.zeros((T + 1, *first_obs.shape), dtype=first_obs.dtype, device=device)  # images stay uint8: 4x smaller
     values = torch.zeros((T + 1, N), device=device)
@@ -446,16 +446,13 @@ def train(
 # ------------------------------------------------------------------------------------------------- command line
 def main() -> None:
     args, envs, run, state, stop = bookkeeping.open_run(Args, description=__doc__)
-    try:
+    with bookkeeping.ending_in_one_line(args, run, stop):
         if args.evaluate is None:
             agent = train(args, envs, run, state, stop)
         else:
             agent = make_agent(args, envs)
             run.restore_agent(state, agent)
         bookkeeping.finish(args, partial(make_policy, agent, args.seed), run, stop)
-    except FloatingPointError as error:
-        bookkeeping.print_message(f"{run.path}: {error}")
-        sys.exit(1)
 
 
 if __name__ == "__main__":

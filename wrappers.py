@@ -15,7 +15,7 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import ale_py
 import gymnasium as gym
@@ -107,11 +107,40 @@ def env_seeds(seed: int | list[int], num_envs: int, starts: int = 0) -> list[int
     return [int(number) for number in numbers[-num_envs:]]
 
 
+class EnvironmentFailed(Exception):
+    """Whatever came out of an environment that is a program of somebody else's, `sys.exit()` included."""
+
+
+class Guarded(VectorWrapper):
+    """Raises EnvironmentFailed for any error in a reset or a step; one in `close` is only reported."""
+
+    def reset(self, **given):
+        return self.guard(self.env.reset, **given)
+
+    def step(self, actions: np.ndarray):
+        return self.guard(self.env.step, actions)
+
+    def guard(self, method: Callable, *given, **named):
+        try:
+            return method(*given, **named)
+        except (Exception, SystemExit) as error:
+            raise EnvironmentFailed(f"{type(error).__name__}: {error}") from error
+
+    def close(self, **kwargs):
+        try:
+            self.guard(self.env.close, **kwargs)
+        except EnvironmentFailed as error:
+            print(f"The environment could not be closed ({error})", file=sys.stderr)
+
+
 class WithoutInfo(gym.Wrapper):
     """Drops an environment's own infos: keys such as `episode` or `final_obs` would be taken for the wrappers' here."""
 
-    def reset(self, **given):
-        return self.env.reset(**given)[0], {}
+    def reset(self, *, seed=None, options=None):
+        if seed is not None:  # for environments that draw from their spaces
+            self.unwrapped.action_space.seed(seed)
+            self.unwrapped.observation_space.seed(seed)
+        return self.env.reset(seed=seed, options=options)[0], {}
 
     def step(self, action):
         return (*self.env.step(action)[:4], {})
@@ -286,7 +315,8 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
                 wrappers=[preprocess],
                 **({} if video is None else {"render_mode": "rgb_array"}),
             )
-            envs.reset()  # an environment that cannot start is refused here, too
+            envs.reset()  # an environment that cannot start, or has another interface, is refused here, too
+            envs.step(np.zeros(num_envs, np.int64))
             screen = None if video is None else envs.render()[0]
     except gym.error.UnregisteredEnv as error:
         close = difflib.get_close_matches(env_id.lower(), atari_specs(), n=1)
@@ -295,11 +325,11 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
         verb = "built" if video is None else "rendered"
         raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}") from error
     if video is None:
-        return RecordEpisodeStatistics(FiniteNumbers(envs))
+        return Guarded(RecordEpisodeStatistics(FiniteNumbers(envs)))
     if not (isinstance(screen, np.ndarray) and screen.dtype == np.uint8 and screen.ndim == 3 and screen.shape[2] == 3):
         raise ValueError("no video can be made of it: its render is not an array (height, width, 3) of uint8")
     envs = RecordVideo(envs, video, float(envs.metadata.get("render_fps") or 30))
-    return RecordEpisodeStatistics(FiniteNumbers(envs))
+    return Guarded(RecordEpisodeStatistics(FiniteNumbers(envs)))
 
 
 def import_registrations(env_id: str) -> None:

@@ -187,9 +187,11 @@ def test_a_checkpoint_is_evaluated_and_the_run_goes_on_after_it(script, tmp_path
 def test_an_evaluated_run_is_rid_of_points_after_its_checkpoint(script, tmp_path, call_main):
     call_main(script, *flags_of(**CARTPOLE, total_timesteps=1280, stop_at=256))
     run_dir = run_dir_in(tmp_path / "runs")
-    kept = (run_dir / "checkpoint.pt").read_bytes()
+    kept = checkpoint_of(run_dir)
     call_main(script, "--resume", str(run_dir), "--stop-at", "512")
-    (run_dir / "checkpoint.pt").write_bytes(kept)  # as if the process had been killed before its next checkpoint
+    # As if the process had been killed after the checkpoint that it writes at its start
+    sizes = {path.name: kept["event_files"].get(path.name, 0) for path in run_dir.glob("events.*.[0-9]*")}
+    torch.save({**kept, "event_files": sizes}, run_dir / "checkpoint.pt")
     assert call_main(script, "--evaluate", str(run_dir), "--eval-episodes", "2").status == 0
     assert call_main(script, "--resume", str(run_dir), "--stop-at", "640")[:2] == (0, "")
     logged = scalars(run_dir)

@@ -1,5 +1,10 @@
 """Environments small enough for tests, registered when this module is imported."""
 
+import multiprocessing
+import os
+import random
+import signal
+import sys
 import time
 from pathlib import Path
 
@@ -68,11 +73,12 @@ class Endless(gym.Env):
 
 
 class Stuck(Endless):
-    """Its first step takes an hour."""
+    """The fifth step of a game takes an hour."""
 
     def step(self, action):
-        Path("stuck").touch()
-        time.sleep(3600)
+        if self.steps == 4:
+            Path("stuck").touch()
+            time.sleep(3600)
         return super().step(action)
 
 
@@ -151,6 +157,60 @@ class CannotStart(gym.Env):
         raise FileNotFoundError("level.txt")
 
 
+class Awkward(gym.Env):
+    """A program of somebody else's: games of ten steps, in which it does what its trait says."""
+
+    observation_space, action_space = Box(-1, 1, (2,), np.float64), Discrete(2)
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+
+    def __init__(self, trait: str, render_mode: str | None = None):
+        self.trait, self.render_mode, self.steps, self.renders = trait, render_mode, 0, 0
+        if trait == "takes signals":
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, lambda *_: None)
+        if trait == "forks":
+            self.child = multiprocessing.get_context("fork").Process(target=time.sleep, args=(3600,), daemon=True)
+            self.child.start()
+
+    def observe(self) -> np.ndarray:
+        if self.trait == "draws globally":
+            return np.array([np.random.uniform(), random.random()]) + self.action_space.sample()
+        return self.np_random.uniform(size=2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.observe(), {}
+
+    def step(self, action):
+        self.steps += 1
+        if self.steps == 100:
+            if self.trait == "raises":
+                raise RuntimeError("simulator\nlost")
+            if self.trait == "exits":
+                sys.exit()
+            if self.trait == "leaves":
+                os.chdir("..")
+            Path("step-100").touch()
+        result = self.observe(), 1.0, self.steps % 10 == 0, False, {}
+        return result[:4] if self.trait == "is old" else result
+
+    def render(self):
+        self.renders += 1
+        if self.trait == "renders no more" and self.renders > 3:
+            raise RuntimeError("no screen")
+        return np.zeros((40, 60, 3), np.uint8)
+
+    def close(self):
+        if self.trait == "does not close":
+            raise RuntimeError("already gone")
+        if self.trait == "forks":
+            self.child.terminate()
+            self.child.join()
+
+
+TRAITS = ["takes signals", "forks", "draws globally", "raises", "exits", "leaves", "is old", "renders no more"]
+for trait in [*TRAITS, "does not close"]:
+    gym.register(f"{trait.title().replace(' ', '')}-v0", Awkward, kwargs={"trait": trait})
 gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})
 gym.register("CannotBeReset-v0", CannotStart, kwargs={"fails_in": "reset"})
 gym.register("CountsFromFive-v0", CountsFromFive)

@@ -53,10 +53,11 @@ def test_an_environment_that_does_not_close_is_reported(script, call_main):
 
 
 def test_a_directory_that_an_environment_leaves_stays_the_runs(script, tmp_path, call_main, monkeypatch):
-    (tmp_path / "here").mkdir()
-    monkeypatch.chdir(tmp_path / "here")
+    start = tmp_path / "a" / "b" / "c" / "d" / "e" / "f" / "g" / "h"  # it goes up once for each copy
+    start.mkdir(parents=True)
+    monkeypatch.chdir(start)
     assert call_main(script, *flags("Leaves")).status == 0
-    assert checkpoint_of(run_dir_in(tmp_path / "here" / "runs"))["global_step"] == 320
+    assert checkpoint_of(run_dir_in(start / "runs"))["global_step"] == 320
 
 
 def test_global_generators_and_spaces_are_seeded(script, tmp_path, call_main):

@@ -165,6 +165,8 @@ class Awkward(gym.Env):
 
     def __init__(self, trait: str, render_mode: str | None = None):
         self.trait, self.render_mode, self.steps, self.renders = trait, render_mode, 0, 0
+        if trait == "leaves":
+            os.chdir("..")
         if trait == "takes signals":
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: None)
@@ -188,8 +190,6 @@ class Awkward(gym.Env):
                 raise RuntimeError("simulator\nlost")
             if self.trait == "exits":
                 sys.exit()
-            if self.trait == "leaves":
-                os.chdir("..")
             Path("step-100").touch()
         result = self.observe(), 1.0, self.steps % 10 == 0, False, {}
         return result[:4] if self.trait == "is old" else result

@@ -73,17 +73,20 @@ def optimizer_step(fused: bool = True, late: bool = False, flush: bool = False) 
     thread = ThreadPoolExecutor(1, initializer=torch.set_flush_denormal, initargs=(flush,))
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-9, fused=fused)
 
+    def prepare():  # in that thread: this program's own would flush the numbers to 0
+        network(torch.rand(2, 4, 84, 84)).sum().backward()
+        optimizer.step()
+        for parameter in network.parameters() if late else ():
+            dead = parameter.numel() // 8
+            parameter.grad.view(-1)[:dead] = 0
+            optimizer.state[parameter]["exp_avg"].view(-1)[:dead] = 4 * 2.0**-149
+
     def run():
         if late:
             nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         optimizer.step()
 
-    network(torch.rand(2, 4, 84, 84)).sum().backward()
-    thread.submit(run).result()
-    for parameter in network.parameters() if late else ():
-        dead = parameter.numel() // 8
-        parameter.grad.view(-1)[:dead] = 0
-        optimizer.state[parameter]["exp_avg"].view(-1)[:dead] = 4 * 2.0**-149
+    thread.submit(prepare).result()
     return lambda: thread.submit(run).result()
 
 

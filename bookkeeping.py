@@ -673,6 +673,7 @@ def open_run(args_class: type, description: str):
         envs = make_envs(args.env_id, args.num_envs if args.evaluate is None else 1, args.threads)
         if args.evaluate is not None:
             envs.close()  # it has told its spaces; the evaluation builds its own, and some can only exist once
+        stop.listen_again()
     except ValueError as error:
         usage_error(as_flag("env_id", args.env_id), error)
     run = run or RunDirectory.make(args, start_directory)  # last, so that nothing refused above leaves one behind

@@ -123,7 +123,7 @@ def tune_process() -> None:
     import torch
 
     # Adam's moments of dead units shrink to denormal numbers, at 150 cycles each: late in a run gradient clipping and a
-    # step take 2 to 4 times as long (benchmark/tricks.py). Now, because torch's threads inherit this at their start
+    # step take 2 to 3 times as long (benchmark/tricks.py). Now, because torch's threads inherit this at their start
     torch.set_flush_denormal(True)
 
 

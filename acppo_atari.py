@@ -294,7 +294,7 @@ def policy_change(logprobs, new_logprobs, actions, advantages) -> dict[str, Tens
     ratio = logratio.exp()
     tv_distance = 0.5 * (new_logprobs.exp() - logprobs.exp()).abs().sum(1)
     return {
-        "kl": (logprobs.exp() * (logprobs - new_logprobs)).sum(1).mean(),
+        "kl": (logprobs.exp() * (logprobs - new_logprobs)).sum(1).mean().clamp(min=0),  # rounding may take it below
         "old_approx_kl": -logratio.mean(),
         "approx_kl": ((ratio - 1) - logratio).mean(),
         "tv_distance": tv_distance.mean(),

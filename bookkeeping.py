@@ -34,7 +34,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
-from typing import Annotated, Any, BinaryIO, NamedTuple
+from typing import Annotated, Any, BinaryIO
 
 import filelock
 import numpy as np
@@ -137,27 +137,9 @@ def code_hash(script: str | os.PathLike) -> str:
     return f"sha256 {hashlib.sha256(ast.unparse(code).encode()).hexdigest()}"
 
 
-class Progress(NamedTuple):
-    """How far a run is. Its text is the status line, which `find` reads again."""
-
-    step: int  # agent steps done
-    last_step: int  # with which this call ends
-    steps_per_second: float
-    score: float | None  # mean of the last 100 games
-
-    def __str__(self) -> str:
-        left = timedelta(seconds=int((self.last_step - self.step) / self.steps_per_second))
-        score = "" if self.score is None else f", score {self.score:.1f}"
-        return f"step {self.step:,} of {self.last_step:,}, {self.steps_per_second:.0f} SPS{score}, {left} left"
-
-    @classmethod
-    def find(cls, text: str) -> "Progress | None":
-        """Returns the last status line in a text."""
-        found = re.findall(r"step ([\d,]+) of ([\d,]+), (\d+) SPS(?:, score (-?[\d.]+))?", text)
-        if not found:
-            return None
-        *numbers, score = (number.replace(",", "") for number in found[-1])
-        return cls(*map(int, numbers), float(score) if score else None)
+def rounded(score: float) -> str:
+    """Returns a score with at least three digits: some environments' lie between 0 and 1."""
+    return f"{score:.1f}" if abs(score) >= 10 else f"{score:.3g}"
 
 
 # ---------------------------------------------------------------------------------------------------- arguments
@@ -229,20 +211,38 @@ def check_args(args) -> None:
 
 
 def saved_args(args) -> dict[str, object]:
-    """Returns the arguments that belong to the run, not to one call of it."""
-    return {name: value for name, value in vars(args).items() if name not in PER_CALL_ARGS}
+    """Returns the arguments that belong to the run, not to one call of it, as lists, numbers and texts."""
+
+    def plain(value):
+        if isinstance(value, (list, tuple)):
+            return list(map(plain, value))
+        return str(value) if isinstance(value, os.PathLike) else value
+
+    return {name: plain(value) for name, value in vars(args).items() if name not in PER_CALL_ARGS}
+
+
+def as_words(values: dict[str, object], defaults: dict[str, object]) -> list[str]:
+    """Returns saved arguments as words of a command line, without those that have their default."""
+    words = []
+    for name, value in values.items():
+        flag = name.replace("_", "-")
+        if name in defaults and value == defaults[name]:
+            continue
+        if isinstance(value, bool):
+            words.append(f"--{'' if value else 'no-'}{flag}")
+        elif isinstance(value, list):
+            words += [f"--{flag}", *map(str, value)]
+        else:
+            words.append(f"--{flag}={value}")
+    return words
 
 
 def repeat_command(args) -> str:
     """Returns the command that repeats the run: all that is not the default, and always game, seed and threads."""
-    words, defaults = ["python", os.path.basename(inspect.getfile(type(args)))], vars(type(args)())
-    for name, value in saved_args(args).items():
-        if value != defaults[name] or name in ("env_id", "seed", "threads"):
-            if isinstance(value, bool):
-                words.append(f"--{'' if value else 'no-'}{name.replace('_', '-')}")
-            else:
-                words.append(f"--{name.replace('_', '-')}={value}")
-    return shlex.join(words)
+    defaults = saved_args(type(args)())
+    for always in ("env_id", "seed", "threads"):
+        del defaults[always]
+    return shlex.join(["python", os.path.basename(inspect.getfile(type(args))), *as_words(saved_args(args), defaults)])
 
 
 def call_command(args, *flags: str) -> str:
@@ -399,7 +399,7 @@ class RunDirectory:
                     os.remove(os.path.join(self.path, name))  # a full disk would get one at every call
                 raise
 
-    def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], step: int) -> None:
+    def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], step: int, seed: int) -> None:
         """Writes games as (score, length) to `eval.csv`, and their statistics to an event file of their own.
 
         A resumed run keeps that file, which has nothing to do with how far the training had got.
@@ -408,10 +408,14 @@ class RunDirectory:
 
         path = os.path.join(self.path, "eval.csv")
         with self.reporting("the evaluation"):
-            with open(path, "a", encoding="utf-8", newline="") as file:
-                header = [] if file.tell() else [("step", "game", "score", "length")]
-                rows = [(step, number, *game) for number, game in enumerate(games, start=1)]
-                csv.writer(file).writerows([*header, *rows])
+            rows = {}  # (step, seed, number) → score and length: the same game once more replaces its row
+            if os.path.exists(path):
+                with open(path, encoding="utf-8", newline="") as file:
+                    for row in csv.DictReader(file):  # without a seed in older runs
+                        rows[row["step"], row.get("seed", ""), row["game"]] = row["score"], row["length"]
+            rows |= {(str(step), str(seed), str(number)): game for number, game in enumerate(games, start=1)}
+            table = [("step", "seed", "game", "score", "length"), *((*key, *game) for key, game in rows.items())]
+            write_file(path, "".join(f"{','.join(map(str, line))}\n" for line in table))
             with SummaryWriter(self.path, filename_suffix=".eval") as writer:
                 for name, value in stats.items():
                     writer.add_scalar(f"eval/{name}", value, step)
@@ -552,8 +556,10 @@ class StatusLine:
         self.due = time.perf_counter() + 60
 
     def show(self, args, iteration: int, sps: float, last_scores: deque) -> None:
-        score = float(np.mean(last_scores)) if last_scores else None
-        line = str(Progress(iteration * args.batch_size, args.last_iteration * args.batch_size, sps, score))
+        step, last_step = iteration * args.batch_size, args.last_iteration * args.batch_size
+        score = f", score {rounded(np.mean(last_scores))}" if last_scores else ""
+        left = timedelta(seconds=int((last_step - step) / sps))
+        line = f"step {step:,} of {last_step:,}, {sps:.0f} SPS{score}, {left} left"
         if os.isatty(2):
             line = line[: (os.get_terminal_size(2).columns or 80) - 1]  # a line that wraps cannot be written over
             print_message(line, end="\n" if iteration == args.last_iteration else "")
@@ -602,9 +608,9 @@ def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSigna
     scores = np.array([score for score, _ in games] or [math.nan])
     std = scores.std(ddof=1) if len(scores) > 1 else 0.0
     stats = {"mean": scores.mean(), "std": std, "median": np.median(scores), "min": scores.min(), "max": scores.max()}
-    run.log_evaluation(games, stats, step)
-    shown = " ".join(f"{name} {value:.1f}" for name, value in stats.items())
-    print_message(f"{len(games)} games at step {step:,}: {shown}", descriptor=1)
+    run.log_evaluation(games, stats, step, args.seed)
+    described = " ".join(f"{name} {rounded(value)}" for name, value in stats.items())
+    print_message(f"{len(games)} games at step {step:,}: {described}", descriptor=1)
     return True
 
 
@@ -652,7 +658,8 @@ def open_run(args_class: type, description: str):
         this_call = {"resume": args.resume, "evaluate": args.evaluate}
         if name == "evaluate":  # the run's own are for its training
             this_call |= {own: getattr(args_class(), own) for own in ("capture_video", "eval_episodes", "threads")}
-        args = tyro.cli(args_class, description=description, default=replace(args_class(**state["args"]), **this_call))
+        saved = tyro.cli(args_class, args=as_words(state["args"], saved_args(args_class())))
+        args = tyro.cli(args_class, description=description, default=replace(saved, **this_call))
         for fixed in ("env_id", "num_envs", "num_steps", "exp_name", "seed"):  # an evaluation may have another seed
             if getattr(args, fixed) != state["args"][fixed] and (fixed, name) != ("seed", "evaluate"):
                 message = f"the run has {state['args'][fixed]}, which cannot change"
@@ -674,8 +681,12 @@ def open_run(args_class: type, description: str):
         if args.evaluate is not None:
             envs.close()  # it has told its spaces; the evaluation builds its own, and some can only exist once
         stop.listen_again()
-    except ValueError as error:
+    except (OSError, ValueError) as error:
         usage_error(as_flag("env_id", args.env_id), error)
+    try:  # the largest part of a rollout's storage
+        np.empty((args.num_steps, *envs.observation_space.shape), envs.observation_space.dtype)
+    except MemoryError as error:
+        usage_error(as_flag("num_steps", args.num_steps), error)
     run = run or RunDirectory.make(args, start_directory)  # last, so that nothing refused above leaves one behind
     emulated = args.bf16 and processor_kind() not in ("AMX", "AVX512-BF16", "ARM-BF16")
     if emulated and not (args.cuda and torch.cuda.is_available()):

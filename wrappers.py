@@ -67,6 +67,7 @@ def make_envs(
 
     Raises:
         ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
+        OSError: the game's ROM is missing or another one.
     """
     if (atari := find_atari_game(env_id)) is None:
         return make_gymnasium_envs(env_id, num_envs, video)
@@ -323,7 +324,8 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
         raise ValueError(f"did you mean {atari_specs()[close[0]].name}?" if close else error) from error
     except (Exception, SystemExit) as error:  # whatever a foreign module or constructor raises
         verb = "built" if video is None else "rendered"
-        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}") from error
+        hint = "; the name is taken by this project's file, rename yours" if "'wrappers'" in str(error) else ""
+        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}{hint}") from error
     if video is None:
         return Guarded(RecordEpisodeStatistics(FiniteNumbers(envs)))
     if not (isinstance(screen, np.ndarray) and screen.dtype == np.uint8 and screen.ndim == 3 and screen.shape[2] == 3):

@@ -30,7 +30,7 @@ import filelock
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
-from bookkeeping import PositiveInt, Progress, StopSignal, available_cores, check_args, code_hash, usage_error
+from bookkeeping import PositiveInt, StopSignal, available_cores, check_args, code_hash, saved_args, usage_error
 from wrappers import canonical_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -121,7 +121,7 @@ def read_variant(word: str, total_timesteps: int) -> Variant:
         grid_flags = [f"--total-timesteps={total_timesteps}", f"--exp-name={name}"]
         arguments = tyro.cli(module.Args, prog=script, args=[*flags, *grid_flags])
         check_args(arguments)
-        return Variant(name, script, text, code_hash(script), flags, vars(arguments))
+        return Variant(name, script, text, code_hash(script), flags, saved_args(arguments))
     except (Exception, SystemExit) as error:  # a script may raise anything; of SystemExit tyro has said the reason
         usage_error(given, f"cannot be trained ({type(error).__name__}: {error})")
 
@@ -259,7 +259,7 @@ def describe(runs: list[Run], began: float) -> str:
     for run in runs:
         if run.state == "unfinished" and run.log.exists() and run.log.stat().st_mtime > began:
             said = run.log.read_text(encoding="utf-8", errors="replace").rpartition("$ ")[2]  # since its last start
-            lines.append(f"  {run.name}: {Progress.find(said) or 'starts'}")
+            lines.append(f"  {run.name}: {(['starts'] + re.findall('step .* left', said))[-1]}")
     return "\n".join(lines)
 
 
@@ -271,6 +271,8 @@ def main() -> None:
     except ValueError as error:
         usage_error(f"--games {' '.join(args.games)}", error)
     check_args(args)
+    if len(args.seeds) == 1 and args.seeds[0] > 1:
+        print(f"--seeds {args.seeds[0]}: this is one seed, number {args.seeds[0]}", file=sys.stderr)
     variants = [read_variant(word, args.total_timesteps) for word in dict.fromkeys(args.variants)]
     grid = itertools.product(dict.fromkeys(args.seeds), dict.fromkeys(args.games), variants)  # each once
     runs = [make_run(game, variant, seed, args) for seed, game, variant in grid]

@@ -308,11 +308,16 @@ def test_run_directory_of_another_training_is_refused_at_once(source, status, tm
     assert call(*flags)[0] == status and call(*flags, "--no-figures")[0] == 0
 
 
+@pytest.mark.parametrize(("seeds", "said"), [(("2",), "--seeds 2: this is one seed, number 2\n"), (("1", "2"), "")])
+def test_one_seed_is_not_taken_for_a_number_of_seeds(seeds, said, tmp_path, call):
+    assert call("--seeds", *seeds, "--out", str(tmp_path), "--dry-run")[2] == said
+
+
 def test_progress_is_what_a_run_has_said_since_its_start(tmp_path):
     run, queued = (make_run("ppo", tmp_path, game) for game in ("Phoenix", "Qbert"))
     run.log.parent.mkdir()
-    now = bookkeeping.Progress(250_880, 1_000_000, 400.0, -12.5)
-    run.log.write_text(f"2026 $ python\n{now._replace(step=1024)}\n{now}\n")
+    now = "step 250,880 of 999,424, 400 SPS, score -12.5, 0:31:11 left"
+    run.log.write_text(f"2026 $ python\nstep 1,024 of 999,424, 400 SPS, 0:41:36 left\n{now}\n")
     head = "0 done, 0 failed, 2 unfinished"
     assert atari5.describe([run, queued], began=0) == f"{head}\n  Phoenix__ppo__1: {now}"
     assert atari5.describe([run, queued], began=time.time() + 9) == head  # said in an earlier call

@@ -12,13 +12,11 @@ from pathlib import Path
 
 import pytest
 import tyro
-from hypothesis import given
-from hypothesis import strategies as st
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import acppo_atari
 import bookkeeping
-from bookkeeping import TENSORBOARD_LAYOUT, Progress, check_args, code_hash, git_commit, repeat_command
+from bookkeeping import TENSORBOARD_LAYOUT, check_args, code_hash, git_commit, repeat_command
 from conftest import (
     PATIENCE,
     ROOT,
@@ -31,6 +29,7 @@ from conftest import (
     run_dir_in,
     scalars,
 )
+from siblings import load
 
 
 def documented_tags() -> set[str]:
@@ -93,6 +92,22 @@ def test_the_recorded_command_is_parsed_to_the_same_arguments():
     assert (python, script) == ("python", "acppo_atari.py") and tyro.cli(acppo_atari.Args, args=words) == args
 
 
+def test_lists_tuples_and_paths_of_a_script_are_recorded_and_resumed(script, tmp_path, call_main):
+    fields = '    sizes: tuple[int, ...] = (3, 4)\n    files: tuple[Path, ...] = ()\n    data: Path = Path("x")\n'
+    text = Path(script.__file__).read_text(encoding="utf-8").replace("    num_envs: ", f"{fields}    num_envs: ", 1)
+    (tmp_path / "my_ppo.py").write_text(text, encoding="utf-8")
+    mine = load(tmp_path / "my_ppo.py")
+    given = ["--sizes", "5", "6", "7", "--files", "a", "b c", "--data", "d e/f"]
+    call_main(mine, *flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=256, stop_at=128), *given)
+    run_dir = run_dir_in(tmp_path / "runs")
+    words = shlex.split(json.loads((run_dir / "args.json").read_text(encoding="utf-8"))["command"])[2:]
+    trained = []
+    mine.train = lambda args, *_: trained.append((args.sizes, args.files, args.data)) or sys.exit()
+    for flags in (words, ["--resume", str(run_dir)]):
+        assert call_main(mine, *flags).status == 0
+    assert trained == [((5, 6, 7), (Path("a"), Path("b c")), Path("d e/f"))] * 2
+
+
 def test_the_record_of_a_run_is_strict_json(tmp_path, call_main):
     call_main(acppo_atari, *flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=128, eval_episodes=0, c="inf"))
     text = (run_dir_in(tmp_path / "runs") / "args.json").read_text(encoding="utf-8")
@@ -141,11 +156,12 @@ def test_a_scripts_hash_is_of_what_it_does(tmp_path):
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-@given(st.integers(0, 10**12), st.integers(0, 10**12), st.integers(1, 10**6), st.none() | st.integers(-(10**9), 10**9))
-def test_progress_is_read_back_from_its_status_line(step, last_step, speed, score):
-    progress = Progress(min(step, last_step), last_step, float(speed), score if score is None else score / 10)
-    assert Progress.find(f"started\n{Progress(0, 1, 1.0, None)}\n{progress}\n") == progress
-    assert Progress.find("nothing of the kind") is None
+@pytest.mark.parametrize(
+    ("score", "text"),
+    [(-20.26, "-20.3"), (12345.67, "12345.7"), (9.876, "9.88"), (0, "0"), (0.01234, "0.0123"), (1e-5, "1e-05")],
+)
+def test_scores_of_every_size_show_three_digits(score, text):
+    assert bookkeeping.rounded(score) == text
 
 
 def test_help_explains_every_flag(script, monkeypatch, call_main):

@@ -201,3 +201,13 @@ def test_the_change_of_the_policy_on_two_states_worked_out_by_hand(each_script):
         "max_ratio_advantage": 4.5,  # |(2.5 - 1) · (-3)|
     }
     assert {name: value.item() for name, value in change.items()} == pytest.approx(expected)
+
+
+def test_a_policy_that_hardly_moves_has_no_kl_below_zero(each_script):
+    """Rounding alone would give one."""
+    before = torch.randn(1000, 256, 6, generator=torch.Generator().manual_seed(1)).log_softmax(-1)
+    after = (before + 1e-7).log_softmax(-1)
+    sums = (before.exp() * (before - after)).sum(-1).mean(-1)
+    actions, advantages = torch.zeros(256, dtype=torch.int64), torch.zeros(256)
+    measured = [each_script.policy_change(*both, actions, advantages)["kl"] for both in zip(before, after)]
+    assert sums.min() < 0 and torch.equal(torch.stack(measured), sums.clamp(min=0))

@@ -162,9 +162,13 @@ class Awkward(gym.Env):
 
     observation_space, action_space = Box(-1, 1, (2,), np.float64), Discrete(2)
     metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+    exists = False
 
     def __init__(self, trait: str, render_mode: str | None = None):
         self.trait, self.render_mode, self.steps, self.renders = trait, render_mode, 0, 0
+        if trait == "exists once":
+            assert not Awkward.exists, "the port is in use"
+            Awkward.exists = True
         if trait == "leaves":
             os.chdir("..")
         if trait == "takes signals":
@@ -201,6 +205,7 @@ class Awkward(gym.Env):
         return np.zeros((40, 60, 3), np.uint8)
 
     def close(self):
+        Awkward.exists = False
         if self.trait == "does not close":
             raise RuntimeError("already gone")
         if self.trait == "forks":
@@ -209,7 +214,7 @@ class Awkward(gym.Env):
 
 
 TRAITS = ["takes signals", "forks", "draws globally", "raises", "exits", "leaves", "is old", "renders no more"]
-for trait in [*TRAITS, "does not close"]:
+for trait in [*TRAITS, "does not close", "exists once"]:
     gym.register(f"{trait.title().replace(' ', '')}-v0", Awkward, kwargs={"trait": trait})
 gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})
 gym.register("CannotBeReset-v0", CannotStart, kwargs={"fails_in": "reset"})
@@ -218,6 +223,7 @@ gym.register("Endless-v0", Endless)
 gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
 gym.register("RewardNothing-v0", RewardNothing)
 gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)
+gym.register("ShowsMuch-v0", Shows, kwargs={"space": Box(-1, 1, (1_000_000,))})
 gym.register("Stuck-v0", Stuck)
 for name, space in (NUMBERS | NO_NUMBERS).items():
     gym.register(f"Shows{name}-v0", Shows, kwargs={"space": space})

@@ -124,6 +124,8 @@ def tune_process() -> None:
 
     # Adam's moments of dead units shrink to denormal numbers, at 150 cycles each: late in a run gradient clipping and a
     # step take 2 to 3 times as long (benchmark/tricks.py). Now, because torch's threads inherit this at their start
+    for kind in (np.float32, np.float64):
+        np.finfo(kind)  # before 2.4, numpy warns where it finds them flushed, and remembers what it found
     torch.set_flush_denormal(True)
 
 

@@ -16,7 +16,7 @@ from types import ModuleType
 
 import pytest
 
-PPO = Path(__file__).parent.parent / "ppo_atari.py"
+PPO, ACPPO = (Path(__file__).parent.parent / name for name in ("ppo_atari.py", "acppo_atari.py"))
 GIVEN = pytest.StashKey[ModuleType]()  # the script of --script
 
 
@@ -29,6 +29,17 @@ def changes(base: list[str], sibling: list[str]) -> list[tuple[int, int, int, in
     """Returns the hunks (i1, i2, j1, j2) in which the lines i1 to i2 of `base` have become j1 to j2 of `sibling`."""
     opcodes = difflib.SequenceMatcher(None, base, sibling, autojunk=False).get_opcodes()
     return [span for kind, *span in opcodes if kind != "equal"]
+
+
+def counts(base, sibling) -> tuple[int, int, int]:
+    """Returns the lines out, the lines in and the hunks of two scripts' diff."""
+    hunks = changes(lines_of(base), lines_of(sibling))
+    return sum(i2 - i1 for i1, i2, _, _ in hunks), sum(j2 - j1 for _, _, j1, j2 in hunks), len(hunks)
+
+
+def nearer(path) -> Path:
+    """Returns the one of this project's two scripts that fewer lines of a script differ from."""
+    return min((PPO, ACPPO), key=lambda base: sum(counts(base, path)[:2]))
 
 
 def without_docstrings(path) -> list[str]:
@@ -45,7 +56,7 @@ def code_diff(base, sibling) -> list[str]:
     return list(difflib.unified_diff(*map(without_docstrings, (base, sibling)), n=0, lineterm=""))[2:]
 
 
-def changed_definitions(path, base=PPO) -> set[str]:
+def changed_definitions(path, base) -> set[str]:
     """Returns the names of the functions and classes of `base` that a script lacks or has in another form."""
     before, after = (
         {
@@ -91,7 +102,7 @@ def pytest_collection_modifyitems(config, items):
     about_it = {item: bool({"script", "each_script"} & set(item.fixturenames)) for item in items}
     config.hook.pytest_deselected(items=[item for item in items if not about_it[item]])
     items[:] = [item for item in items if about_it[item]]
-    file, own = os.path.basename(script.__file__), changed_definitions(script.__file__)
+    file, own = os.path.basename(script.__file__), changed_definitions(script.__file__, nearer(script.__file__))
     for item in items:
         for marker in item.iter_markers("thesis"):
             if not marker.args:
@@ -103,9 +114,9 @@ def pytest_collection_modifyitems(config, items):
 def pytest_terminal_summary(terminalreporter, config):
     if (script := config.stash.get(GIVEN, None)) is None:
         return
-    hunks = changes(lines_of(PPO), lines_of(script.__file__))
-    lines_out, lines_in = sum(i2 - i1 for i1, i2, _, _ in hunks), sum(j2 - j1 for _, _, j1, j2 in hunks)
-    counts = f"{lines_out} lines out, {lines_in} in, {len(hunks)} hunks"
-    terminalreporter.section(f"{os.path.basename(script.__file__)} against ppo_atari.py: {counts}; without docstrings")
-    for line in code_diff(PPO, script.__file__):
+    base, file = nearer(script.__file__), os.path.basename(script.__file__)
+    lines_out, lines_in, hunks = counts(base, script.__file__)
+    size = f"{lines_out} lines out, {lines_in} in, {hunks} hunks"
+    terminalreporter.section(f"{file} against {base.name}: {size}; without docstrings")
+    for line in code_diff(base, script.__file__):
         terminalreporter.write_line(line)

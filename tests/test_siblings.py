@@ -12,9 +12,7 @@ from pathlib import Path
 import pytest
 
 from conftest import ROOT
-from siblings import PPO, changed_definitions, changes, code_diff, lines_of, load
-
-ACPPO = ROOT / "acppo_atari.py"
+from siblings import ACPPO, PPO, changed_definitions, changes, code_diff, lines_of, load
 
 PLACES = {  # places that a hunk may touch: lines from the one to the other, the second not included
     "docstring": ('"""', "Sections: "),
@@ -90,5 +88,5 @@ def test_a_script_from_anywhere_can_import_the_files_beside_it(tmp_path, monkeyp
 
 
 def test_changed_definitions_are_known_by_their_text():
-    assert changed_definitions(ACPPO) == {"Args", "clip_range", "train"}
-    assert changed_definitions(PPO) == set()
+    assert changed_definitions(ACPPO, PPO) == {"Args", "clip_range", "train"}
+    assert changed_definitions(PPO, PPO) == set()

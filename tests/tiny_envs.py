@@ -16,18 +16,20 @@ from gymnasium.spaces import Box, Dict, Discrete, Graph, MultiBinary, MultiDiscr
 class TinyPixels(gym.Env):
     """A bright column moves left or right; the left edge pays and ends the episode.
 
-    Actions: 0 left, 1 right. Reward: 1 at the left edge. `max_episode_steps` truncates.
+    Actions: 0 left, 1 right. Reward: 1 at the left edge. `max_episode_steps` truncates. It begins in column `start`, or
+    at random.
     """
 
     action_space = Discrete(2)
 
-    def __init__(self, channels: int | None = 3):
+    def __init__(self, channels: int | None = 3, start: int | None = None):
+        self.start = start
         shape = (36, 48) if channels is None else (36, 48, channels)
         self.observation_space = Box(0, 255, shape, np.uint8)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
-        self.column = int(self.np_random.integers(4, 12))
+        self.column = self.start or int(self.np_random.integers(4, 12))
         return self.screen(), {}
 
     def step(self, action):
@@ -222,6 +224,7 @@ gym.register("CountsFromFive-v0", CountsFromFive)
 gym.register("Endless-v0", Endless)
 gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
 gym.register("RewardNothing-v0", RewardNothing)
+gym.register("SameGame-v0", TinyPixels, max_episode_steps=2, kwargs={"start": 2})  # of two steps, whatever the seed
 gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)
 gym.register("ShowsMuch-v0", Shows, kwargs={"space": Box(-1, 1, (1_000_000,))})
 gym.register("Stuck-v0", Stuck)

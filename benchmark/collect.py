@@ -27,6 +27,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # so that they are found from anywhere
 from bookkeeping import usage_error, write_file
+from wrappers import canonical_name
 
 ROOT = Path(__file__).resolve().parent.parent
 DEFAULT_OUT = ROOT / "results"
@@ -92,7 +93,7 @@ def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
     wall = sum(end - readers[start].FirstEventTimestamp() for start, end in ends.items()) / 3600
     return {
         "variant": args["exp_name"],
-        "game": args["env_id"],
+        "game": canonical_name(args["env_id"]),  # by which published scores are found
         "seed": args["seed"],
         "note": "",
         "source": directory.resolve().name,
@@ -127,11 +128,15 @@ def read_provenance(readers: list[EventAccumulator], last: dict[str, object]) ->
 
 
 def read_evaluation(file: Path) -> dict[str, float | None] | None:
-    """Returns games, mean and sample standard deviation of the last evaluation in eval.csv, None without one."""
+    """Returns games, mean and sample standard deviation of the last step in eval.csv, None without a file.
+
+    A game that was played again counts once. Files of older runs do not say its seed.
+    """
     if not file.exists():
         return None
     table = pd.read_csv(file, encoding="utf-8")
-    last = table[table.index >= table.index[table.game == 1].max()]  # each evaluation begins with game 1
+    last = table[table.step == table.step.max()]
+    last = last.drop_duplicates([name for name in ("seed", "game") if name in table], keep="last")
     mean, std = (float(f"{number:.6g}") for number in (last.score.mean(), last.score.std(ddof=1)))
     return {"games": len(last), "mean": mean, "std": std if len(last) > 1 else None}
 

@@ -5,33 +5,38 @@ last step that all of these have reached. `unfinished`: of each game that has an
 least half as long as its longest unfinished one, up to the last step that all of these have reached; of a finished run
 these are the first steps.
 
-How a claim is judged. The thesis's baseline is `ppo`, its challenger `acppo`; two other variants can stand in their
-places. A pair is a run of each with the same game and seed. Each pair has a margin for each claim, above 0 if it has
-the claim's sign:
+How a claim is judged. The thesis's baseline is `ppo`, its challenger `acppo`; other variants can stand in their places.
+A pair is a run of each with the same game and seed. Each pair has a margin for each claim, above 0 if it has the
+claim's sign:
     score            final `mean_return_100`, challenger - baseline (across games in units of human minus random score)
     KL               log of the ratio of the means of `losses/kl`, baseline / challenger
     relative spikes  share of iterations with a KL above the 99th percentile of the baseline's in the same game (all its
                      seeds), baseline - challenger
     own spikes       share of iterations with a KL above ten times the run's own median, baseline - challenger
-    clip ratio       0.02 - |mean of `losses/avg_clip_ratio` - the baseline's ε|, so for PPO's 0.1 above 0 from 0.08 to
-                     0.12; only of the challenger's runs
-On one game a claim holds if every margin is above 0, and does not hold if every margin is below 0; else the two cannot
-be told apart with these runs. Across games the same is asked of both ends of the 95 % interval of the interquartile
-mean of all margins. With fewer than three pairs, on the game or on any of the games, the two cannot be told apart at
-all: of two equal algorithms two pairs agree every second time, three still every fourth. For unfinished runs it is too
-early to judge a final score.
+    clip ratio       0.02 - |difference of the means of `losses/avg_clip_ratio`|, so above 0 if the challenger's is
+                     near the baseline's; of no pair in which the ranges of one do not clip
+Over all pairs of all games, a claim is judged by Wilcoxon's signed-rank test of their margins: exact, that is over all
+2ⁿ assignments of signs, and two-sided. Equal sizes share their mean rank; a margin of 0 keeps its rank and counts for
+neither sign. A claim holds, or does not hold, at p ≤ 0.05; else the two cannot be told apart with these runs. With
+fewer than six pairs that is always so: p is at least 2 of 2ⁿ. On one game a claim holds if every margin is above 0, and
+does not hold if every margin is below 0. With fewer than three pairs on the game the two cannot be told apart there: of
+two equal algorithms two pairs agree every second time, three still every fourth. Three pairs can never be below
+p = 0.25, so this is the weaker verdict. For unfinished runs it is too early to judge a
+final score. A KL below 1e-8 is a 0 with the rounding errors of float32, and counts as 1e-8.
 
 This rule was committed eight minutes into the first two of the runs (8073f69), before any had ended. Added since: that
 all runs of a game are cut at one step, not each pair at its own (when the seeds had come to different lengths); the
-stages, and that final scores wait for 90 % of the schedule (when one pair had finished, in which ppo scores more).
+stages, and that final scores wait for 90 % of the schedule (when one pair had finished, in which ppo scores more). On
+2026-11-28, while 2 of the 15 pairs were finished (ppo scores more in both) and before the next had ended: the exact
+test took the place of the 95 % bootstrap interval of the interquartile mean, which excluded 0 for two equal algorithms
+one time in ten; and the clip ratio is held against the baseline's mean, pair by pair, no longer against its ε.
 
-The interval is the percentile bootstrap that draws seeds with replacement within each game. From three seeds it is too
-narrow: of two equal algorithms, three normal pairs on each of five games, it excludes 0 one time in ten, not in twenty
-(tests/test_results.py counts). A plain mean is never used: the human score of DoubleDunk is 2.2 points above random.
+The size of an effect is the interquartile mean of all margins, which the test does not use. A plain mean is never used:
+the human score of DoubleDunk is 2.2 points above random.
 """
 
+import itertools
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -41,13 +46,16 @@ import pandas as pd
 from benchmark.collect import Curves, Runs
 
 FINISHED = 0.9  # of its schedule
-FEWEST_PAIRS = 3
-SCORES = pd.read_csv(Path(__file__).parent / "scores.csv", encoding="utf-8").fillna({"note": ""})  # published ones
-# Game → scores of human and random play, which have no agent steps, and their difference
+FEWEST_PAIRS_OF_A_GAME, FEWEST_PAIRS = 3, 6
+SCORES = pd.read_csv(Path(__file__).with_name("scores.csv"), encoding="utf-8").fillna({"note": ""})  # published ones
+# Game → scores of human and random play, which have no agent steps
 PLAYED = SCORES[SCORES.agent_steps.isna()].pivot(index="game", columns="source", values="score_mean")
-PLAYED = PLAYED.assign(range=PLAYED.human - PLAYED.random)
-UNDECIDED = "cannot be told apart with these runs"
-DRAWS = 10_000  # of the bootstrap
+# Of the Atari-5 score (Aitchison et al. 2022, github.com/maitchison/Atari-5): game → weight, random and human score
+ATARI_5 = pd.read_csv(Path(__file__).with_name("atari5.csv"), index_col="game", encoding="utf-8")
+HOLDS, FAILS, UNDECIDED = "holds", "does not hold", "cannot be told apart with these runs"
+TOO_FEW = "too few pairs"  # to tell the two apart, whatever their margins
+LEAST_KL = 1e-8
+LEVEL = 0.05  # of p
 VARIANT_ORDER = ("ppo", "acppo", "ppo-matched", "ppo-wide", "product")  # the thesis's two first; others by name
 
 
@@ -55,17 +63,21 @@ VARIANT_ORDER = ("ppo", "acppo", "ppo-matched", "ppo-wide", "product")  # the th
 class Stage:
     name: str  # finished or unfinished
     baseline: str
-    challenger: str
-    epsilon: float  # the baseline's, NaN if it has none
+    epsilons: dict[str, float]  # variant → its widest clip range, of those whose ranges clip and have a bound
     runs: Runs = field(default_factory=dict)
     drawn: Curves = field(default_factory=dict)  # as far as the figures show them
     compared: Curves = field(default_factory=dict)  # as the tables and claims compare them
 
 
-def make_stages(runs: Runs, curves: Curves, baseline: str = "ppo", challenger: str = "acppo") -> list[Stage]:
-    """Returns the stages that have runs, the finished one first; runs are sorted by game, variant and seed."""
-    epsilon = epsilons(runs).get(baseline, math.nan)
-    stages = [Stage(name, baseline, challenger, epsilon) for name in ("finished", "unfinished")]
+def make_stages(runs: Runs, curves: Curves, baseline: str = "ppo", unclipped: tuple[str, ...] = ()) -> list[Stage]:
+    """Returns the stages that have runs, the finished one first; runs are sorted by game, variant and seed.
+
+    Variants in `unclipped` have no ε and no clip ratio.
+    """
+    curves = {key: curve.assign(kl=curve.kl.clip(lower=LEAST_KL)) for key, curve in curves.items()}
+    clipped = {key: run for key, run in runs.items() if key[0] not in unclipped}
+    curves |= {key: curves[key].assign(avg_clip_ratio=math.nan) for key in runs.keys() - clipped.keys()}
+    stages = [Stage(name, baseline, find_epsilons(clipped)) for name in ("finished", "unfinished")]
     for game in games(curves):
         keys = [(name, game, seed) for name in variants(curves) for seed in sorted(seeds(curves, name, game))]
         ends = {key: curves[key].index[-1] for key in keys}
@@ -93,33 +105,40 @@ def seeds(curves: Curves, variant: str, game: str) -> dict[int, pd.DataFrame]:
     return {key[2]: curve for key, curve in curves.items() if key[:2] == (variant, game)}
 
 
-def pairs(stage: Stage, game: str) -> list[tuple[pd.DataFrame, pd.DataFrame]]:
+def pairs(stage: Stage, challenger: str, game: str) -> list[tuple[pd.DataFrame, pd.DataFrame]]:
     """Returns the curves of baseline and challenger, seed by seed."""
-    base, new = (seeds(stage.compared, variant, game) for variant in (stage.baseline, stage.challenger))
+    base, new = (seeds(stage.compared, variant, game) for variant in (stage.baseline, challenger))
     return [(base[seed], new[seed]) for seed in sorted(base.keys() & new.keys())]
 
 
-def epsilons(runs: Runs) -> dict[str, float]:
+def find_epsilons(runs: Runs) -> dict[str, float]:
     """Returns each variant's ε, its widest clip range, if it has one; with c = inf the range has no bound."""
     bounded = {key[0]: run["arguments"] for key, run in runs.items() if str(run["arguments"].get("c")) != "inf"}
     return {name: args["clip_coef"] for name, args in bounded.items() if "clip_coef" in args}
 
 
-def interquartile_mean(values: np.ndarray) -> np.ndarray:
-    """(..., n) → (...): the mean of the middle half; of a value on its border, the part inside (scipy takes all)."""
-    borders = np.linspace(0, 1, values.shape[-1] + 1)  # value i of the sorted ones covers borders[i] to borders[i + 1]
-    weights = 2 * np.diff(borders.clip(0.25, 0.75))
-    return np.sort(values, axis=-1) @ weights
+def interquartile_mean(values: np.ndarray) -> float:
+    """(n,) → the mean of the middle half; of a value on its border, the part inside (scipy takes all)."""
+    borders = np.linspace(0, 1, len(values) + 1)  # value i of the sorted ones covers borders[i] to borders[i + 1]
+    return float(np.sort(values) @ (2 * np.diff(borders.clip(0.25, 0.75))))
 
 
-def bootstrap_interval(strata: list[np.ndarray]) -> tuple[float, float] | None:
-    """Returns the 95 % interval of the interquartile mean of games' values (seeds,), seeds redrawn within a game."""
-    if min(map(len, strata)) < 2:
-        return None  # drawing from one seed gives itself, an interval without the width that seeds have
-    generator = np.random.default_rng(0)  # the same runs give the same interval
-    drawn = [generator.choice(values, (DRAWS, len(values))) for values in strata]
-    low, high = np.quantile(interquartile_mean(np.concatenate(drawn, axis=1)), [0.025, 0.975])
-    return float(low), float(high)
+def signed_rank_test(margins: np.ndarray) -> tuple[float, float]:
+    """Returns the sum of signed ranks of margins (n,), doubled, and its exact two-sided p."""
+    sizes = np.abs(margins)
+    ranks = [2 * (sizes < size).sum() + (sizes == size).sum() + 1 for size in sizes]  # doubled, so whole numbers
+    shares = np.ones(1)  # of the assignments of signs, by the sum of the positive ranks
+    for rank in itertools.compress(ranks, margins):
+        shares = (np.pad(shares, (rank, 0)) + np.pad(shares, (0, rank))) / 2
+    total = np.sign(margins) @ np.array(ranks, dtype=float)
+    totals = 2 * np.arange(len(shares)) - (len(shares) - 1)
+    return total, float(shares[np.abs(totals) >= abs(total)].sum())
+
+
+def atari5_score(scores: pd.Series) -> float:
+    """Returns an estimate, by the scores of its five games, of the median over 57 games in % of human play."""
+    percent = 100 * (scores - ATARI_5.random) / (ATARI_5.human - ATARI_5.random)
+    return float(10 ** (ATARI_5.weight * np.log10(1 + percent.clip(lower=0))).sum(skipna=False) - 1)
 
 
 def spike_limit(stage: Stage, game: str) -> float:
@@ -136,31 +155,48 @@ def share_of_own_spikes(kl: pd.Series) -> float:
     return share_above(kl, 10 * kl.median())
 
 
-def find_margins(stage: Stage) -> dict[str, dict[str, np.ndarray]]:
-    """Returns claim → game → (pairs,) by the rule that opens this file, without pairs in which no game has ended."""
+def find_margins(stage: Stage, challenger: str) -> dict[str, dict[str, np.ndarray]]:
+    """Returns claim → game → (pairs,) by the rule that opens this file, without pairs that lack the measure."""
     margins: dict[str, dict[str, np.ndarray]] = {}
     for game in games(stage.compared):
-        both, limit = pairs(stage, game), spike_limit(stage, game)
-        of_new = seeds(stage.compared, stage.challenger, game).values()
+        both, limit = pairs(stage, challenger, game), spike_limit(stage, game)
         of_game = {
             "score": [new.mean_return_100.iloc[-1] - base.mean_return_100.iloc[-1] for base, new in both],
             "KL": [np.log(base.kl.mean()) - np.log(new.kl.mean()) for base, new in both],
             "relative spikes": [share_above(base.kl, limit) - share_above(new.kl, limit) for base, new in both],
             "own spikes": [share_of_own_spikes(base.kl) - share_of_own_spikes(new.kl) for base, new in both],
-            "clip ratio": [0.02 - abs(new.avg_clip_ratio.mean() - stage.epsilon) for new in of_new],
+            "clip ratio": [0.02 - abs(new.avg_clip_ratio.mean() - base.avg_clip_ratio.mean()) for base, new in both],
         }
         for claim, values in of_game.items():
             margins.setdefault(claim, {})[game] = np.array([value for value in values if math.isfinite(value)])
-    return margins
+    return {claim: of_games for claim, of_games in margins.items() if any(map(len, of_games.values()))}
 
 
-def in_human_ranges(margins: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Returns differences of scores in units of human minus random score, of the games that have these."""
-    return {game: values / PLAYED.range[game] for game, values in margins.items() if game in PLAYED.index}
+def pool(claim: str, margins: dict[str, np.ndarray]) -> np.ndarray:
+    """Returns all games' margins; scores of several games in units of human minus random score, where that is known."""
+    comparable = claim != "score" or len(margins) < 2
+    units = dict.fromkeys(margins, 1) if comparable else (PLAYED.human - PLAYED.random).to_dict()
+    return np.concatenate([np.zeros(0), *(margins[game] / units[game] for game in margins if game in units)])
 
 
-def judge(fewest_pairs: int, margins: Sequence[float] | None) -> str:
-    """Judges the margins of a game's pairs, or across games both ends of the interval."""
-    if fewest_pairs < FEWEST_PAIRS or min(margins) <= 0 <= max(margins):
-        return UNDECIDED
-    return "holds" if min(margins) > 0 else "does not hold"
+def judge_game(margins: np.ndarray) -> str:
+    if len(margins) < FEWEST_PAIRS_OF_A_GAME:
+        return TOO_FEW
+    return UNDECIDED if min(margins) <= 0 <= max(margins) else HOLDS if min(margins) > 0 else FAILS
+
+
+def judge(margins: np.ndarray) -> str:
+    """Judges the margins of all games' pairs."""
+    total, p = signed_rank_test(margins)
+    if p > LEVEL:
+        return TOO_FEW if len(margins) < FEWEST_PAIRS else UNDECIDED
+    return HOLDS if total > 0 else FAILS
+
+
+def find_change(margins: np.ndarray) -> tuple[int, str]:
+    """Returns how few further pairs could change what `judge` says, and whether for or against the claim."""
+    decided, largest = signed_rank_test(margins)[1] <= LEVEL, 2 * np.abs(margins).max(initial=0.5)
+    for count, side in itertools.product(range(1, 1000), (1, -1)):
+        more = np.append(margins, [side * largest] * count)
+        if (signed_rank_test(more)[1] <= LEVEL) != decided:
+            return count, "for" if side > 0 else "against"

@@ -55,8 +55,6 @@ def draw_figure(name: str, stage: Stage) -> Figure:
         axis.set_ylabel(columns[column] if axis.get_subplotspec().is_first_col() else "")
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
         axis.locator_params(axis="x", nbins=4)
-        if name == "avg_clip_ratio" and math.isfinite(stage.epsilon):
-            axis.axhline(stage.epsilon, color=colour(curves, stage.baseline), linestyle="--", linewidth=1.5)
     lines = [Line2D([], [], linewidth=3, label=name, color=colour(curves, name)) for name in variants(curves)]
     figure.legend(handles=lines, title=title, loc="outside upper center", ncols=6)
     return figure

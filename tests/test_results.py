@@ -21,8 +21,10 @@ from conftest import ROOT
 
 BATCH = 1024  # agent steps of an iteration
 VERSIONS = {"python": "3.12", "torch": "2.13.0"}
-EPSILONS = {"acppo": {"clip_coef": 0.16, "c": 1.0}, "mine": {"clip_coef": 0.2}, "without": {}}
+EPSILONS = {"acppo": {"clip_coef": 0.16, "c": 1.0}, "mine": {"clip_coef": 0.2}}
 EPSILONS["product"] = {"clip_coef": 0.1, "c": "inf"}
+RECORD = {"steps": 1024, "arguments": {}, "commit": "", "versions": {}, "machine": "Linux, 2 cores"}
+RECORD |= {"evaluation": None, "hours": None}
 
 
 def make_arguments(variant: str, game: str, seed: int) -> dict:
@@ -62,12 +64,8 @@ def make_stages(runs: dict[tuple, dict], iterations: int | None = None, **pair) 
     for key, columns in runs.items():
         curve = pd.DataFrame({**dict.fromkeys(collect.TAGS, 0.1), "games_ended": 100, **columns})
         curves[key] = curve.set_index(BATCH * np.arange(1, len(curve) + 1))
-    about = {
-        "total_timesteps": (iterations or max(map(len, curves.values()))) * BATCH,
-        "evaluation": None,
-        "hours": None,
-    }
-    records = {key: {**about, "versions": {}, "arguments": make_arguments(*key)} for key in runs}
+    steps = (iterations or max(map(len, curves.values()))) * BATCH
+    records = {key: RECORD | {"total_timesteps": steps, "arguments": make_arguments(*key)} for key in runs}
     return claims.make_stages(records, curves, **pair)
 
 
@@ -118,14 +116,14 @@ def test_games_count_from_where_they_end_and_starts_where_they_differ(tmp_path):
 
 def test_a_run_is_its_record_and_a_curve_of_six_digits(tmp_path):
     directory = make_training(tmp_path, "acppo", seed=7, kl=[1 / 3, 1e-5 / 3], mean_return_100=[9, 10])
-    games = [(1, 10), (2, 20), (1, 10), (2, 20), (3, 60)]  # of two evaluations; the last one counts
-    (directory / "eval.csv").write_text("step,game,score,length\n" + "".join(f"1024,{n},{s},99\n" for n, s in games))
+    games = [(1, 10), (2, 20), (1, 11), (2, 20), (3, 60)]  # of two evaluations; the last one counts
+    (directory / "eval.csv").write_text("step,game,score,length\n" + "".join(f"2048,{n},{s},99\n" for n, s in games))
     (path,) = collect.collect(tmp_path)
     record = json.loads((path / "run.json").read_text())
     assert (path, record["source"]) == (tmp_path / "runs" / "CartPole-v1__acppo__7", "CartPole-v1__acppo__7__1")
     known = {"variant": "acppo", "game": "CartPole-v1", "seed": 7, "note": "", "steps": 2048, "versions": VERSIONS}
     known |= {"commit": "abc", "machine": "a machine", "command": "ppo_atari.py"}
-    known |= {"evaluation": {"games": 3, "mean": 30, "std": 26.4575}}
+    known |= {"evaluation": {"games": 3, "mean": 30.3333, "std": 26.0832}}
     assert record | known | {"arguments": make_arguments("acppo", "CartPole-v1", 7)} == record
     rows = pd.read_csv(path / "curve.csv.gz", dtype=str)
     assert list(rows.columns) == ["step", *collect.TAGS, "games_ended"]
@@ -134,6 +132,14 @@ def test_a_run_is_its_record_and_a_curve_of_six_digits(tmp_path):
     (path / "curve.csv.gz").write_bytes(gzip.compress(b"step,kl,games_ended\n1024,0.5,3\n"))
     (curve,) = collect.read_runs(tmp_path)[1].values()  # of an older run, which lacks what is newer
     assert list(curve.columns) == [*collect.TAGS, "games_ended"] and curve.kl[1024] == 0.5
+
+
+def test_an_evaluation_is_the_last_step_of_all_seeds_and_a_game_has_ale_pys_name(tmp_path):
+    directory = make_training(tmp_path, game="pong", kl=[1])
+    games = ["512,1,1,7", "1024,1,1,10", "1024,2,1,20", "1024,1,1,12", "1024,1,2,31"]  # the second is replaced
+    (directory / "eval.csv").write_text("step,seed,game,score,length\n" + "".join(f"{game},99\n" for game in games))
+    record, _ = collect.read_training(directory)
+    assert record["evaluation"] == {"games": 3, "mean": 21, "std": 9.53939} and record["game"] == "Pong"
 
 
 def test_a_new_run_adds_files_and_an_older_one_is_updated(tmp_path):
@@ -174,38 +180,87 @@ def test_interquartile_mean_weighs_borders_by_their_part_inside():
         assert claims.interquartile_mean(np.array(values, dtype=float)) == pytest.approx(mean)
 
 
-def test_interval_is_that_of_all_ways_to_redraw_seeds_within_games():
-    strata = [np.array([0.1, 0.5, 0.4]), np.array([1.0, 3.0, 1.7])]
-    ways = [list(itertools.product(values, repeat=3)) for values in strata]  # 27 × 27, equally likely
-    means = sorted(claims.interquartile_mean(np.array(one + other)) for one, other in itertools.product(*ways))
-    low, high = claims.bootstrap_interval(strata)  # 2 to 3 % of the 729 lie below it, and as many above it
-    assert means[14] - 1e-9 < low < means[21] + 1e-9 and means[-22] - 1e-9 < high < means[-15] + 1e-9
-    # Across games 0 and 10 would mix; within a game there is nothing to mix
-    assert claims.bootstrap_interval([np.zeros(3), np.full(3, 10.0)]) == (5, 5)
-    assert claims.bootstrap_interval([np.zeros(3), np.zeros(1)]) is None
+def test_signed_rank_p_is_the_share_of_all_assignments_of_signs():
+    assert claims.signed_rank_test(np.arange(1.0, 7))[1] == 2 / 64
+    by_hand = {(5.0, -1, 2, 2, -9): (4, 1, 2.5, 2.5, 5), (0.0, 0, -3, 7, 7, 7, 9): (1.5, 1.5, 3, 5, 5, 5, 7)}
+    for margins, ranks in by_hand.items():
+        ways = itertools.product((-1, 1), repeat=len(ranks))
+        totals = [abs(sum(sign * rank for sign, rank, size in zip(way, ranks, margins) if size)) for way in ways]
+        observed = abs(sum(rank * np.sign(size) for rank, size in zip(ranks, margins)))
+        assert claims.signed_rank_test(np.array(margins))[1] == np.mean(np.array(totals) >= observed)
 
 
-def test_interval_of_three_pairs_excludes_0_one_time_in_ten(monkeypatch):
-    """For two equal algorithms a 95 % interval should do so one time in twenty; the texts say ten."""
-    monkeypatch.setattr(claims, "DRAWS", 1000)
-    generator = np.random.default_rng(1)
-    intervals = [claims.bootstrap_interval(list(generator.standard_normal((5, 3)))) for _ in range(1000)]
-    assert 0.08 < np.mean([low > 0 or high < 0 for low, high in intervals]) < 0.12
+@pytest.mark.parametrize(("sizes", "errors"), [(range(1, 6), 0), (range(1, 7), 2), (range(1, 10), 20), ([1] * 9, 20)])
+def test_equal_algorithms_are_told_apart_at_most_one_time_in_twenty(sizes, errors):
+    ways = [np.array(sizes) * way for way in itertools.product((-1, 1), repeat=len(sizes))]  # equally likely
+    judged = [claims.judge(margins) for margins in ways]
+    assert judged.count("holds") == judged.count("does not hold") == errors / 2 <= len(ways) / 40
+    assert judged.count("too few pairs") == (len(ways) if len(sizes) < 6 else 0)
+
+
+def test_a_shift_of_one_deviation_is_found_with_15_pairs():
+    judged = [claims.judge(margins) for margins in np.random.default_rng(1).normal(1, 1, (500, 15))]
+    assert judged.count("holds") > 450
+
+
+def test_the_fewest_pairs_that_change_a_verdict_are_as_counted_by_hand():
+    for margins, change in (([], (6, "for")), ([-1, -2], (4, "against")), ([1, 2, 3, 4, 5, 6], (1, "against"))):
+        assert claims.find_change(np.array(margins)) == change
+
+
+def test_atari5_scores_are_the_published_ones_and_wait_for_all_five_games():
+    source, games = claims.SCORES.pivot(index="game", columns="source", values="score_mean"), claims.ATARI_5.index
+    ppo2, envpool = (source.filter(like=name).iloc[:, 0] for name in ("ppo2", "envpool"))
+    rainbow = pd.Series((62010, -0.3, 13136, 108528.6, 33817.5), games)  # arXiv 1710.02298, no-op starts
+    known = (claims.ATARI_5.random, 0), (claims.ATARI_5.human, 85.05), (ppo2, 68.11), (envpool, 76.57), (rainbow, 225.1)
+    assert [claims.atari5_score(scores[games]) for scores, _ in known] == pytest.approx(
+        [right for _, right in known], 1e-4
+    )
+    runs = {("ppo", game, 2): {"mean_return_100": [human]} for game, human in claims.ATARI_5.human.items()}
+    runs |= dict.fromkeys([("acppo", "Qbert", 1), ("acppo", "Pong", 1)], {"kl": [1]})
+    rows = cells(report.atari5_table(make_stages(runs)[0].compared))[2:]
+    assert sorted(rows) == [["acppo", "1", "needs BattleZone, DoubleDunk, NameThisGame, Phoenix"], ["ppo", "2", "85.1"]]
+
+
+def test_the_table_of_runs_says_what_is_known_of_each():
+    known = {"hours": {"wall": 2.04}, "evaluation": {"games": 30, "mean": 8.5, "std": 0.5}, "arguments": {"bf16": True}}
+    known |= {"machine": "A, 2 cores, AVX2; B, 2 cores, AVX2; C, 4 cores", "commit": f"{'a' * 40}; {'b' * 40}-dirty"}
+    records = {("ppo", "Pong", 1): RECORD | known, ("ppo", "Pong", 2): RECORD}
+    curve = pd.DataFrame({"mean_return_100": [1, 12345.6], "kl": [0.1, 0.3]})
+    text = report.run_table(records, dict.fromkeys(records, curve))
+    rows = [row[5:] for row in cells(text)[2:]]
+    assert "12,345.6" in text and "known of 1 of 2, 2.0 in all" in text and rows[1] == ["–", "0.2", "2 cores", "–", ""]
+    assert rows[0] == ["8.50 ± 0.50 (n = 30)", "0.2", "2 cores, AVX2; 4 cores, bf16", "2.0", "aaaaaaa; bbbbbbb-dirty"]
+
+
+def test_scores_far_below_1_keep_three_digits():
+    numbers = {0: "0.0", 0.0123: "0.0123", -0.95: "-0.950", 12.34: "12.3", 12345.6: "12,345.6", math.nan: "–"}
+    assert {number: report.score(number) for number in numbers} == numbers
+    assert report.score(0.0123, 0.0004) == "0.0123 ± 0.0004" and report.score(0, 0.5) == "0.000 ± 0.500"
+
+
+def test_a_kl_of_0_or_below_by_rounding_gives_no_verdict_and_can_be_drawn(tmp_path):
+    base = {("ppo", "Pong", seed): {"kl": [0, -6e-9, 2e-9, 1e-9]} for seed in (1, 2, 3)}
+    for kl, judged in (([-6e-9, 1e-9, -1e-9, 0], "? 0 of 3, 3 equal"), ([0.1] * 4, "✗ 0 of 3")):
+        (stage,) = make_stages(base | {("acppo", "Pong", seed): {"kl": kl} for seed in (1, 2, 3)})
+        rows = cells(report.claims_tables(stage, "acppo")[1])[2:]
+        assert [row[1] for row in rows[1:4]] == [judged, judged, "? 0 of 3, 3 equal"]
+        figures.draw(stage, tmp_path)
 
 
 def test_stages_compare_each_game_at_one_step():
     pong = {("ppo", "Pong", 1): 100, ("acppo", "Pong", 1): 90, ("ppo", "Pong", 2): 88, ("acppo", "Pong", 2): 44}
     lengths = {("ppo", "Qbert", 1): 3, **pong, ("ppo", "Pong", 3): 43}
-    finished, unfinished = make_stages({key: {"kl": range(length)} for key, length in lengths.items()})
+    finished, unfinished = make_stages({key: {"kl": range(1, length + 1)} for key, length in lengths.items()})
     assert (finished.name, unfinished.name) == ("finished", "unfinished")
     assert list(finished.drawn) == [("ppo", "Pong", 1), ("acppo", "Pong", 1)]
-    assert [list(curve.kl) for curve in finished.compared.values()] == [list(range(90))] * 2
+    assert [list(curve.kl) for curve in finished.compared.values()] == [list(range(1, 91))] * 2
     # The figures show them as far as the longest unfinished one, a finished one's first steps too
     drawn, compared = ({key: len(curve) for key, curve in c.items()} for c in (unfinished.drawn, unfinished.compared))
     assert drawn == {**lengths, ("ppo", "Pong", 1): 88, ("acppo", "Pong", 1): 88}
     assert compared == {**dict.fromkeys(pong, 44), ("ppo", "Qbert", 1): 3}
     assert "being shorter than half of their game's longest: Pong ppo 3." in report.coverage(unfinished)
-    assert "2 runs, at 90 % to 100 % of a schedule of 102,400 agent steps. All in float32." in report.coverage(finished)
+    assert "2 runs, at 90 % to 100 % of a schedule of 102,400 agent steps." in report.coverage(finished)
     unfinished.runs["ppo", "Pong", 3]["versions"] = {"script": "another"}
     assert "Some runs of a variant were trained by different versions" in report.coverage(unfinished)
 
@@ -214,7 +269,7 @@ def test_spike_rates_are_as_counted_by_hand():
     ppo, acppo = [1] * 93 + [9] * 2 + [20] * 5, [1] * 97 + [30] * 3  # 99th percentile of the first 20, medians 1
     (stage,) = make_stages({("ppo", "Pong", 1): {"kl": ppo}, ("acppo", "Pong", 1): {"kl": acppo}})
     margins = {"score": 0, "KL": math.log(2.11 / 1.87), "relative spikes": 0 - 0.03, "own spikes": 0.05 - 0.03}
-    found = {claim: of["Pong"].item() for claim, of in claims.find_margins(stage).items()}
+    found = {claim: of["Pong"].item() for claim, of in claims.find_margins(stage, "acppo").items()}
     assert found == pytest.approx({**margins, "clip ratio": 0.02})
     ppo_row, acppo_row = cells(report.kl_table(stage))[2:]
     # The TV distance is 0.1: above PPO's 0.1 / 2, above AC-PPO's 0.16 / 2
@@ -226,55 +281,55 @@ def test_spike_rates_are_as_counted_by_hand():
 
 def test_a_claim_holds_on_a_game_where_three_pairs_all_agree():
     differences = ([1, 2, 3], [-1, -2, -3], [1, 2, -3], [1, 2, 0], [1, 2], [math.nan, 1, 1, 1])
-    tables = [cells(report.claims_table(make_pairs({"Pong": of_game}))) for of_game in differences]
-    judged = ["✓ 3 of 3", "✗ 0 of 3", "? 2 of 3", "? 2 of 3, 1 equal", "? 2 of 2", "✓ 3 of 3"]
-    assert [table[2] for table in tables] == [["AC-PPO's final score is above PPO's", cell, "–"] for cell in judged]
+    tables = [cells(report.claims_tables(make_pairs({"Pong": each}), "acppo")[1]) for each in differences]
+    judged = ["✓ 3 of 3", "✗ 0 of 3", "? 2 of 3", "? 2 of 3, 1 equal", "too few pairs (2 of 2)", "✓ 3 of 3"]
+    assert [table[2] for table in tables] == [["AC-PPO's final score is above PPO's", cell] for cell in judged]
 
 
-@pytest.mark.parametrize(("breakout", "sign"), [([1, 2, 3], "✓ holds"), ([-4, -5, -6], "?"), ([1, 2], "?")])
-def test_a_claim_is_judged_across_games_by_its_interval(breakout, sign):
-    judged = sign if sign != "?" else f"? {claims.UNDECIDED}"
-    stage = make_pairs({"Pong": [5, 6, 7], "Breakout": breakout, "CartPole-v1": [9, 9, 9]})
-    strata = [np.array(breakout) / (30.5 - 1.7), np.array([5, 6, 7]) / (14.6 + 20.7)]  # CartPole has no human score
-    mean, interval = claims.interquartile_mean(np.concatenate(strata)), claims.bootstrap_interval(strata)
-    shown = "{:+.3f} of human minus random score ({:+.3f} to {:+.3f})".format(mean, *interval)
-    assert cells(report.claims_table(stage))[2][-1] == f"{judged}: {shown}"
-    assert cells(report.human_table(stage))[-1][3] == f"{mean:.3f}"
+def test_a_claim_is_judged_over_all_games_by_their_pairs_in_human_ranges():
+    stage = make_pairs({"Pong": [5, 6, 7], "Breakout": [-1, 2, 3, 4], "CartPole-v1": [9, 9, 9]})
+    margins = np.array([5, 6, 7]) / 35.3, np.array([-1, 2, 3, 4]) / 28.8  # CartPole has no human score
+    mean = f"{claims.interquartile_mean(np.concatenate(margins)):+.3g} of human minus random score"
+    # Of the 128 assignments of signs, two are more extreme than a single minus at the smallest, and two are as extreme
+    row = ["✓ holds", mean, "6 of 7, p = 0.031", "1 or more further pairs, all against it"]
+    assert cells(report.claims_tables(stage, "acppo")[0])[2][1:] == row
+    two = cells(report.claims_tables(make_pairs({"Pong": [-1, -3]}), "acppo")[0])[2][1:]
+    assert two == ["? too few pairs", "-2 points", "0 of 2, p = 0.5", "4 or more further pairs, all against it"]
 
 
 def test_a_final_score_waits_for_90_percent_of_the_schedule():
     stages = [make_pairs({"Pong": [5, 6, 7], "Breakout": [1, 2, 3]}, iterations) for iterations in (2, 3)]
-    (score, *others), (early, *early_others) = (cells(report.claims_table(stage))[2:] for stage in stages)
-    assert score[1] == "✓ 3 of 3" and early[1:] == ["too early"] * 3 and others == early_others
-    assert ["(human − random)" in report.results_part([stage]) for stage in stages] == [True, False]
+    for part in (0, 1):
+        rows = (cells(report.claims_tables(stage, "acppo")[part])[2:] for stage in stages)
+        (score, *others), (early, *early_others) = rows
+        assert score[1][0] == "✓" and early[1] == "too early" and others == early_others
     shorts = [cells(report.short_table(shown))[2:] for shown in (stages, stages[1:])]  # the first stage that has a game
-    assert [row[-1] for rows in shorts for row in rows] == ["✓ 3 of 3 pairs"] * 2 + ["too early"] * 2
+    assert [row[-1] for rows in shorts for row in rows] == ["✓ 3 of 3"] * 2 + ["too early"] * 2
 
 
 @pytest.mark.parametrize(
-    ("baseline", "challenger", "base", "new", "near", "signs"),
+    ("baseline", "challenger", "title", "signs"),
     [
-        ("ppo", "acppo", "PPO", "AC-PPO", "0.1 (0.08 to 0.12)", "✗✗✗?✓"),
-        ("ppo", "mine", "PPO", "mine", "0.1 (0.08 to 0.12)", "✓✓??✗"),
-        ("mine", "ppo", "mine", "PPO", "0.2 (0.18 to 0.22)", "✗✗✗?✗"),
-        ("product", "ppo", "product", "PPO", "which no run has", "✗✗✗??"),  # c = inf
-        ("without", "ppo", "without", "PPO", "which no run has", "✗✗✗??"),  # of a script that has no ε
+        ("ppo", "acppo", "Claims of the thesis", "✗✗✗?✓"),
+        ("ppo", "mine", "mine against PPO", "✓✓??✗"),
+        ("mine", "ppo", "PPO against mine", "✗✗✗?✗"),
+        ("acppo", "acppo", "AC-PPO against AC-PPO", "????✓"),
+        ("product", "ppo", "PPO against product", "✗✗✗?✗"),  # c = inf
+        ("ppo", "spo", "spo against PPO", "✓✓??"),  # of ranges that do not clip
     ],
 )
-def test_verdicts_are_on_the_variants_that_are_named(baseline, challenger, base, new, near, signs):
-    columns = {"ppo": ([0, 10], [1, 5], 0.1), "acppo": ([0, 9], [6, 6], 0.11)}
-    columns |= dict.fromkeys(("mine", "product", "without"), ([0, 12], [1, 1], 0.13))
+def test_verdicts_are_on_the_variants_that_are_named(baseline, challenger, title, signs):
+    columns = {"ppo": ([0, 10], [1, 5], 0.1), "acppo": ([0, 9], [6, 6], 0.119)}
+    columns |= dict.fromkeys(("mine", "product", "spo"), ([0, 12], [1, 1], 0.13))
     columns = {name: dict(zip(("mean_return_100", "kl", "avg_clip_ratio"), of)) for name, of in columns.items()}
     runs = {(variant, "Pong", seed): columns[variant] for variant in columns for seed in (1, 2, 3)}
-    (stage,) = make_stages(runs, baseline=baseline, challenger=challenger)
-    rows = cells(report.claims_table(stage))[2:]
-    assert rows[0][0] == f"{new}'s final score is above {base}'s"
-    assert rows[-1][0] == f"{new}'s average clip ratio is near {base}'s ε, {near}"
-    assert "".join(row[1][0] for row in rows) == signs
-    assert f"| {challenger} − {baseline}, by pairs |" in report.results_part([stage])
-    lines = figures.draw_figure("avg_clip_ratio", stage).axes[0].lines
-    dashed = [(str(line.get_ydata()[0]), line.get_color()) for line in lines if line.get_linestyle() == "--"]
-    assert dashed == ([] if near[0] == "w" else [(near.split()[0], figures.colour(stage.drawn, baseline))])
+    (stage,) = make_stages(runs, baseline=baseline, unclipped=("spo",))
+    page = report.page_parts([stage], (challenger, "mine"))
+    base, new = (report.DISPLAY_NAMES.get(name, name) for name in (baseline, challenger))
+    assert page["verdicts"].startswith(f"{title}, finished runs:") and f"mine against {base}, fin" in page["verdicts"]
+    rows = cells(page["results"].partition(f"{title}, by games:")[2].partition(" against ")[0])[2:]
+    assert rows[0][0] == f"{new}'s final score is above {base}'s" and "".join(row[1][0] for row in rows[:5]) == signs
+    assert cells(report.kl_table(stage))[-1][-2:] == ["–", "–"]  # spo has no ε / 2 and no clip ratio
 
 
 def test_the_score_table_says_where_games_are_few():
@@ -292,7 +347,7 @@ def test_progress_is_told_in_tenths_once_all_have_done_half(schedule, ended):
     (stage,) = make_stages({("ppo", "Pong", 1): {"mean_return_100": range(20), "kl": [1, 3] * 10}}, iterations=schedule)
     score, kl = cells(report.progress_table(stage))[2:] or ((), ())
     assert list(kl).count("–") == (10 - ended if ended else 0)  # those tenths have not ended
-    assert list(score[2 : 2 + ended]) == [str(schedule * i // 10 - 1) for i in range(1, ended + 1)]
+    assert list(map(float, score[2 : 2 + ended])) == [schedule * i // 10 - 1 for i in range(1, ended + 1)]
     assert schedule % 20 or list(kl[2 : 2 + ended]) == ["2"] * ended
 
 
@@ -339,7 +394,7 @@ def test_equal_runs_make_equal_files_and_touch_no_other_set(tmp_path, call_main)
 
 def test_bad_input_is_refused_in_one_line(tmp_path, call_main):
     collect.collect(tmp_path, [make_training(tmp_path / "elsewhere", kl=[1], mean_return_100=[1])])
-    (tmp_path / "README.md").write_text("<!-- end results -->\n<!-- results -->\n")  # nothing in between
+    (tmp_path / "README.md").write_text("<!-- end verdicts -->\n<!-- verdicts -->\n")  # nothing in between
     flags = {"--note none": "the note none", "--note a/b": "letters", "--challenger x": "one of ppo", "": "between"}
     for given, words in flags.items():
         assert words in refusal(call_main, report, "--out", ".", *given.split())
@@ -349,13 +404,13 @@ def test_the_committed_pages_are_what_report_makes_of_the_runs(tmp_path, monkeyp
     out, pages = tmp_path / "results", [ROOT / "README.md", *collect.DEFAULT_OUT.glob("*.md")]
     shutil.copytree(collect.DEFAULT_OUT / "runs", out / "runs")
     for page in pages:
-        text = re.sub("(?<=<!-- results -->\n).*?(?=<!-- end)", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        text = re.sub(r"(<!-- (\w+) -->\n).*?(?=<!-- end \2)", r"\1", page.read_text(encoding="utf-8"), flags=re.DOTALL)
         (tmp_path / page.relative_to(ROOT)).write_text(text, encoding="utf-8")
     monkeypatch.setattr(report, "ROOT", tmp_path)
     monkeypatch.setattr(report, "DEFAULT_OUT", out)
     monkeypatch.setattr(report, "draw", lambda stage, directory: None)
-    for flags in ("", "--note 83-percent", "--note spo --challenger spo"):
-        call_main(report, "--out", "results", *flags.split())
+    for flags in ("", "--note 83-percent", "--note spo --challenger acppo spo"):
+        assert call_main(report, "--out", "results", *flags.split()).status == 0
     for page in pages:
         assert (tmp_path / page.relative_to(ROOT)).read_bytes() == page.read_bytes(), "run benchmark/report.py"
     linked = [name for page in pages[1:] for name in re.findall(r"\((figures/.*?)\)", page.read_text(encoding="utf-8"))]

@@ -175,7 +175,8 @@ def claims_tables(stage: Stage, challenger: str) -> tuple[str, str]:
         (sentence, form, unit), values = CLAIM_TEXTS[claim], claims.pool(claim, margins)
         sentence, judged, size = sentence.format(**called), claims.judge(values), claims.interquartile_mean(values)
         number = format(math.exp(size) if claim == "KL" else size, form)  # a KL's margin is the log of a ratio
-        effect = (unit if claim != "score" or len(margins) > 1 else "{} points").format(number, **called)
+        in_points = claim == "score" and len(margins) == 1
+        effect = f"{score(size)} points" if in_points else unit.format(number, **called)
         pairs_for = f"{count(values)}, p = {claims.signed_rank_test(values)[1]:.2g}"
         change = "{} or more further pairs, all {} it".format(*claims.find_change(values))
         cells, by_game = [f"{SIGNS[judged]} {judged}", effect, pairs_for, change], map(game_verdict, margins.values())

@@ -124,7 +124,7 @@ def run_table(runs: Runs, curves: Curves) -> str:
         machines = dict.fromkeys(machine.partition(", ")[2] or machine for machine in run["machine"].split("; "))
         row = [key[1], key[0], str(key[2]), f"{run['steps']:,}", score(curve.mean_return_100.iloc[-1])]
         row += [f"{score(played['mean'], played['std'])} (n = {played['games']})" if played else "–"]
-        row += [cell(curve.kl.mean(), ".3g"), ", ".join(["; ".join(machines), *arithmetic])]
+        row += [cell(curve.kl.clip(lower=claims.LEAST_KL).mean(), ".3g"), ", ".join(["; ".join(machines), *arithmetic])]
         row += [f"{run['hours']['wall']:.1f}" if run["hours"] else "–"]
         rows.append([*row, re.sub(r"\b([0-9a-f]{7})[0-9a-f]{33}", r"\1", run["commit"])])
     hours = [run["hours"]["wall"] for run in runs.values() if run["hours"]]

@@ -295,7 +295,7 @@ def main() -> None:
     report = [sys.executable, str(Path(__file__).with_name("report.py")), "--out", str(args.out)]
     names = [variant.name for variant in variants]
     if len(names) > 1 and not {"ppo", "acppo"} <= {*names}:
-        report += ["--baseline", names[0], "--challenger", names[1]]
+        report += ["--baseline", names[0], "--challenger", *names[1:]]
     sys.exit(subprocess.run(report).returncode)
 
 

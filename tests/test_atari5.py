@@ -370,14 +370,14 @@ def test_script_edited_while_the_grid_runs_starts_no_run(my_ppo, tmp_path, monke
 
 
 @pytest.mark.parametrize("variants", ["mine ppo product", "mine acppo ppo", "mine"])
-def test_report_of_ppo_and_acppo_or_the_first_two_if_no_run_failed(variants, my_ppo, tmp_path, call, monkeypatch):
+def test_report_of_acppo_or_of_all_against_the_first_if_no_run_failed(variants, my_ppo, tmp_path, call, monkeypatch):
     called, make, of_run = [], atari5.make_run, {"state": "done"}
     monkeypatch.setattr(subprocess, "run", lambda words: called.extend(words) or subprocess.CompletedProcess(words, 0))
     monkeypatch.setattr(atari5, "make_run", lambda *words: dataclasses.replace(make(*words), **of_run))
     flags = ("--out", "out", "--games", "Qbert", "--variants", *variants.replace("mine", "mine=my_ppo.py").split())
     assert call(*flags)[0] == 0
-    pair = ["--baseline", "mine", "--challenger", "ppo"] if variants == "mine ppo product" else []  # its own default
-    assert called[1:] == [str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out"), *pair]
+    others = ["--baseline", "mine", "--challenger", "ppo", "product"] if variants == "mine ppo product" else []
+    assert called[1:] == [str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out"), *others]
     called.clear()
     of_run |= {"state": "failed", "reason": "a reason"}
     assert call(*flags)[0] == 1 and not called

@@ -28,13 +28,12 @@ import subprocess
 import sys
 import threading
 import time
-import typing
 import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
-from typing import Annotated, Any, BinaryIO
+from typing import Annotated, Any, BinaryIO, NoReturn, get_args, get_type_hints
 
 import filelock
 import numpy as np
@@ -68,7 +67,7 @@ def print_message(text: str, end: str = "\n", descriptor: int = 2) -> None:
         os.write(descriptor, f"{start}{text}{end}".encode(errors="replace"))
 
 
-def usage_error(given: str, advice: object) -> typing.NoReturn:
+def usage_error(given: str, advice: object) -> NoReturn:
     """Ends the program with status 2 and one line: the refused input, and the advice."""
     print_message(" ".join(f"{given}: {advice}".split()))
     sys.exit(2)
@@ -124,8 +123,7 @@ def tune_process() -> None:
 
     # Adam's moments of dead units shrink to denormal numbers, at 150 cycles each: late in a run gradient clipping and a
     # step take 2 to 3 times as long (benchmark/tricks.py). Now, because torch's threads inherit this at their start
-    for kind in (np.float32, np.float64):
-        np.finfo(kind)  # before 2.4, numpy warns where it finds them flushed, and remembers what it found
+    list(map(np.finfo, (np.float32, np.float64)))  # before 2.4, numpy warns where it finds them flushed, and remembers
     torch.set_flush_denormal(True)
 
 
@@ -140,7 +138,7 @@ def code_hash(script: str | os.PathLike) -> str:
 
 
 def rounded(score: float) -> str:
-    """Returns a score with at least three digits: some environments' lie between 0 and 1."""
+    """Returns a score to three digits, or from 10 on to a decimal: some environments' lie between 0 and 1."""
     return f"{score:.1f}" if abs(score) >= 10 else f"{score:.3g}"
 
 
@@ -201,11 +199,11 @@ class RunArgs:
 
 def check_args(args) -> None:
     """Refuses the first argument that is out of its bounds or breaks one of `args.rules()`."""
-    for name, hint in typing.get_type_hints(type(args), include_extras=True).items():
+    for name, hint in get_type_hints(type(args), include_extras=True).items():
         value = getattr(args, name)
-        for kind in (hint, *typing.get_args(hint)) if value is not None else ():  # X, or in `X | None` its parts
+        for kind in (hint, *get_args(hint)) if value is not None else ():  # X, or in `X | None` its parts
             for allow, shown in (bounds for bounds in getattr(kind, "__metadata__", ()) if isinstance(bounds, tuple)):
-                if not allow(value):
+                if not all(map(allow, value if isinstance(value, (list, tuple)) else [value])):
                     usage_error(as_flag(name, value), f"give a value in {shown}")
     for name, holds, advice in args.rules():
         if not holds:
@@ -214,13 +212,8 @@ def check_args(args) -> None:
 
 def saved_args(args) -> dict[str, object]:
     """Returns the arguments that belong to the run, not to one call of it, as lists, numbers and texts."""
-
-    def plain(value):
-        if isinstance(value, (list, tuple)):
-            return list(map(plain, value))
-        return str(value) if isinstance(value, os.PathLike) else value
-
-    return {name: plain(value) for name, value in vars(args).items() if name not in PER_CALL_ARGS}
+    own = {name: value for name, value in vars(args).items() if name not in PER_CALL_ARGS}
+    return json.loads(json.dumps(own, default=str))  # tuples become lists, paths become texts
 
 
 def as_words(values: dict[str, object], defaults: dict[str, object]) -> list[str]:
@@ -228,22 +221,18 @@ def as_words(values: dict[str, object], defaults: dict[str, object]) -> list[str
     words = []
     for name, value in values.items():
         flag = name.replace("_", "-")
-        if name in defaults and value == defaults[name]:
+        if value == defaults[name]:
             continue
         if isinstance(value, bool):
             words.append(f"--{'' if value else 'no-'}{flag}")
-        elif isinstance(value, list):
-            words += [f"--{flag}", *map(str, value)]
         else:
-            words.append(f"--{flag}={value}")
+            words += [f"--{flag}", *map(str, value)] if isinstance(value, list) else [f"--{flag}={value}"]
     return words
 
 
 def repeat_command(args) -> str:
     """Returns the command that repeats the run: all that is not the default, and always game, seed and threads."""
-    defaults = saved_args(type(args)())
-    for always in ("env_id", "seed", "threads"):
-        del defaults[always]
+    defaults = saved_args(type(args)()) | dict.fromkeys(("env_id", "seed", "threads"))
     return shlex.join(["python", os.path.basename(inspect.getfile(type(args))), *as_words(saved_args(args), defaults)])
 
 
@@ -270,10 +259,6 @@ class RunDirectory:
         self.num_starts = 0  # before this one; each start of a run plays other games
         self.last_scores = deque(maxlen=100)  # raw returns of whole games
         self.checkpoint_due = 0.0
-
-    def close(self) -> None:
-        """Lets go of the directory, for another process or object to open it."""
-        self.lock.release()
 
     @classmethod
     def make(cls, args, start_directory: str = ".") -> "RunDirectory":
@@ -402,22 +387,20 @@ class RunDirectory:
                 raise
 
     def log_evaluation(self, games: list[tuple[float, int]], stats: dict[str, float], step: int, seed: int) -> None:
-        """Writes games as (score, length) to `eval.csv`, and their statistics to an event file of their own.
-
-        A resumed run keeps that file, which has nothing to do with how far the training had got.
+        """Writes games as (score, length) to `eval.csv`, in place of rows of the same ones, and their statistics to an
+        event file of their own, which a resumed run keeps, however far the training had got.
         """
         from torch.utils.tensorboard import SummaryWriter
 
         path = os.path.join(self.path, "eval.csv")
         with self.reporting("the evaluation"):
-            rows = {}  # (step, seed, number) → score and length: the same game once more replaces its row
-            if os.path.exists(path):
-                with open(path, encoding="utf-8", newline="") as file:
-                    for row in csv.DictReader(file):  # without a seed in older runs
-                        rows[row["step"], row.get("seed", ""), row["game"]] = row["score"], row["length"]
-            rows |= {(str(step), str(seed), str(number)): game for number, game in enumerate(games, start=1)}
-            table = [("step", "seed", "game", "score", "length"), *((*key, *game) for key, game in rows.items())]
-            write_file(path, "".join(f"{','.join(map(str, line))}\n" for line in table))
+            names, rows = ("step", "seed", "game", "score", "length"), []
+            with contextlib.suppress(FileNotFoundError), open(path, encoding="utf-8", newline="") as file:
+                rows = [[row.get(name, "") for name in names] for row in csv.DictReader(file)]
+            rows = [row for row in rows if row[1] or row[0] != str(step)]  # older runs do not say the seed
+            rows += [[str(step), str(seed), str(number), *game] for number, game in enumerate(games, start=1)]
+            last = {tuple(row[:3]): row for row in rows}
+            write_file(path, "".join(f"{','.join(map(str, row))}\n" for row in (names, *last.values())))
             with SummaryWriter(self.path, filename_suffix=".eval") as writer:
                 for name, value in stats.items():
                     writer.add_scalar(f"eval/{name}", value, step)
@@ -600,9 +583,8 @@ def evaluate(args, policy: Policy, run: RunDirectory, step: int, stop: StopSigna
 
     Returns False if `stop` notes a signal before the last one has ended.
     """
-    envs = make_envs(args.env_id, args.num_envs, args.threads)  # however many games: so each has its number
-    games = play(policy, envs, args.eval_episodes, [args.seed, 1], stop)
-    envs.close()
+    with contextlib.closing(make_envs(args.env_id, args.num_envs, args.threads)) as envs:  # so each game has its number
+        games = play(policy, envs, args.eval_episodes, [args.seed, 1], stop)
     if stop.number:
         return False
     if len(games) < args.eval_episodes:
@@ -685,10 +667,11 @@ def open_run(args_class: type, description: str):
         stop.listen_again()
     except (OSError, ValueError) as error:
         usage_error(as_flag("env_id", args.env_id), error)
-    try:  # the largest part of a rollout's storage
-        np.empty((args.num_steps, *envs.observation_space.shape), envs.observation_space.dtype)
-    except MemoryError as error:
-        usage_error(as_flag("num_steps", args.num_steps), error)
+    if args.evaluate is None and hasattr(os, "sysconf"):  # not on Windows
+        space, memory = envs.observation_space, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 2**30
+        if (needed := args.num_steps * math.prod(space.shape) * space.dtype.itemsize / 2**30) > memory:
+            advice = f"a rollout's observations take {needed:,.0f} GiB, this machine has {memory:,.0f}"
+            usage_error(as_flag("num_steps", args.num_steps), advice)
     run = run or RunDirectory.make(args, start_directory)  # last, so that nothing refused above leaves one behind
     emulated = args.bf16 and processor_kind() not in ("AMX", "AVX512-BF16", "ARM-BF16")
     if emulated and not (args.cuda and torch.cuda.is_available()):
@@ -716,7 +699,7 @@ def ending_in_one_line(args, run: RunDirectory, stop: StopSignal) -> Iterator[No
         sys.exit(128 + stop.number if stop.number else 1)
 
 
-def finish(args, fresh_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> typing.NoReturn:
+def finish(args, fresh_policy: Callable[[], Policy], run: RunDirectory, stop: StopSignal) -> NoReturn:
     """Ends a call whose agent is trained or loaded: evaluates it, or says how to continue. Exits with its status."""
     step, evaluate_only = run.iteration * args.batch_size, args.evaluate is not None  # of the last checkpoint
     done = evaluate_only or run.iteration >= args.last_iteration

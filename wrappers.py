@@ -47,13 +47,12 @@ SMALLEST_SCREEN = 36  # height and width from which on uint8 observations are sc
 def make_envs(
     env_id: str, num_envs: int, num_threads: int = 0, max_frames: int = 108_000, video: str | None = None
 ) -> VectorEnv:
-    """Builds `num_envs` copies of an environment, stepped together, each reset in the step that ends its game.
+    """Builds N = `num_envs` copies of an environment, stepped together, each reset in the step that ends its game.
 
     Args:
         env_id: an Atari game (`Breakout`, `breakout`, `BreakoutNoFrameskip-v4`: the thesis's protocol, without sticky
             actions; `ALE/Breakout-v5`: the same with its registered sticky actions), or any other registered
             Gymnasium id, `module:Env-v0` included: the module may lie in the current directory.
-        num_envs: the number of copies N.
         num_threads: threads that step Atari games; 0 leaves the number to ale-py. Other environments use one.
         max_frames: emulator frames after which an Atari game is truncated, counted from the end of its no-ops.
         video: an MP4 file that the first game of the first environment is written to, from each `reset` on.
@@ -65,9 +64,8 @@ def make_envs(
         `info["episode"]` holds their raw, unclipped scores `"r"` and lengths `"l"` in agent steps; if one was
         truncated, `info["final_obs"]` holds the observation that it ended on (other rows are not to be read).
 
-    Raises:
-        ValueError: the environment is unknown, cannot be built or rendered, or has spaces that are not supported.
-        OSError: the game's ROM is missing or another one.
+    Raises ValueError if the environment is unknown, cannot be built or rendered, or has spaces that are not supported;
+    OSError if the game's ROM is missing or another one.
     """
     if (atari := find_atari_game(env_id)) is None:
         return make_gymnasium_envs(env_id, num_envs, video)
@@ -144,7 +142,8 @@ class WithoutInfo(gym.Wrapper):
         return self.env.reset(seed=seed, options=options)[0], {}
 
     def step(self, action):
-        return (*self.env.step(action)[:4], {})
+        obs, reward, terminated, truncated, _ = self.env.step(action)
+        return obs, reward, terminated, truncated, {}
 
 
 class FiniteNumbers(VectorWrapper):
@@ -262,8 +261,7 @@ class EpisodicLife(VectorWrapper):
 def find_atari_game(env_id: str) -> tuple[str, float] | None:
     """Returns the ROM's name and the probability of sticky actions, or None if `env_id` is not an Atari name.
 
-    Raises:
-        ValueError: an Atari name that cannot be played under the protocol of `make_envs`.
+    Raises ValueError for an Atari name that cannot be played under the protocol of `make_envs`.
     """
     env_id = env_id.removeprefix("ale_py:")  # as elsewhere, where it has Gymnasium import ale-py
     registered = gym.registry.get(env_id.rpartition(":")[2])
@@ -281,10 +279,7 @@ def find_atari_game(env_id: str) -> tuple[str, float] | None:
         return None
     spec = atari_specs()[key]
     if name.startswith("ALE/") or variant not in ("", "NoFrameskip-v4"):
-        raise ValueError(
-            f"not an id of this project's protocol, which skips {FRAME_SKIP} frames itself; "
-            f"use {spec.name}, or {spec.id} for sticky actions"
-        )
+        raise ValueError(f"not an id of this project's protocol; use {spec.name}, or {spec.id} for sticky actions")
     return spec.kwargs["game"], 0.0
 
 
@@ -324,13 +319,12 @@ def make_gymnasium_envs(env_id: str, num_envs: int, video: str | None = None) ->
         raise ValueError(f"did you mean {atari_specs()[close[0]].name}?" if close else error) from error
     except (Exception, SystemExit) as error:  # whatever a foreign module or constructor raises
         verb = "built" if video is None else "rendered"
-        hint = "; the name is taken by this project's file, rename yours" if "'wrappers'" in str(error) else ""
-        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}{hint}") from error
-    if video is None:
-        return Guarded(RecordEpisodeStatistics(FiniteNumbers(envs)))
-    if not (isinstance(screen, np.ndarray) and screen.dtype == np.uint8 and screen.ndim == 3 and screen.shape[2] == 3):
-        raise ValueError("no video can be made of it: its render is not an array (height, width, 3) of uint8")
-    envs = RecordVideo(envs, video, float(envs.metadata.get("render_fps") or 30))
+        advice = "; rename yours, this project has one" if re.search("(from|module) 'wrappers'", str(error)) else ""
+        raise ValueError(f"it cannot be {verb}: {error or type(error).__name__}{advice}") from error
+    if video is not None:
+        if not (isinstance(screen, np.ndarray) and screen.dtype == np.uint8 and screen.shape[2:] == (3,)):
+            raise ValueError("no video can be made of it: its render is not an array (height, width, 3) of uint8")
+        envs = RecordVideo(envs, video, float(envs.metadata.get("render_fps") or 30))
     return Guarded(RecordEpisodeStatistics(FiniteNumbers(envs)))
 
 

@@ -30,7 +30,8 @@ import filelock
 import tyro
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))  # the project's modules are found from any directory
-from bookkeeping import PositiveInt, StopSignal, available_cores, check_args, code_hash, saved_args, usage_error
+import bookkeeping
+from bookkeeping import NonNegativeInt, PositiveInt, StopSignal, available_cores, check_args, usage_error
 from wrappers import canonical_name
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -55,7 +56,7 @@ LOCK_SECONDS = 120  # for which a dead node may still hold a run (NFS: 90), or t
 class Args:
     games: tuple[str, ...] = ATARI_5
     """games, or anything else that the scripts take as `--env-id`; the default is Atari-5 (chapter 4)"""
-    seeds: tuple[int, ...] = (1, 2, 3)
+    seeds: tuple[NonNegativeInt, ...] = (1, 2, 3)
     """seeds of each variant on each game; all games of one seed come before the next"""
     variants: tuple[str, ...] = ("ppo", "acppo")
     """lines of the table VARIANTS in this file, or your own scripts as `"NAME=SCRIPT FLAGS"`"""
@@ -83,7 +84,6 @@ class Args:
         names = [word.partition("=")[0] for word in dict.fromkeys(self.variants)]
         another = {*self.games} - {*ATARI_5} or "=" in "".join(self.variants) or self.total_timesteps != 5_000_000
         return [
-            ("seeds", all(0 <= seed < 2**63 for seed in self.seeds), "give whole numbers from 0 to 2^63 - 1"),
             ("variants", len(names) == len(set(names)), "give each variant another name"),
             ("cpus_per_run", self.address or self.cpus_per_run <= self.cores, f"the grid has {self.cores} cores"),
             ("out", not another or self.out != Args.out, "is for the thesis's games, variants and length"),
@@ -121,7 +121,7 @@ def read_variant(word: str, total_timesteps: int) -> Variant:
         grid_flags = [f"--total-timesteps={total_timesteps}", f"--exp-name={name}"]
         arguments = tyro.cli(module.Args, prog=script, args=[*flags, *grid_flags])
         check_args(arguments)
-        return Variant(name, script, text, code_hash(script), flags, saved_args(arguments))
+        return Variant(name, script, text, bookkeeping.code_hash(script), flags, bookkeeping.saved_args(arguments))
     except (Exception, SystemExit) as error:  # a script may raise anything; of SystemExit tyro has said the reason
         usage_error(given, f"cannot be trained ({type(error).__name__}: {error})")
 
@@ -294,8 +294,9 @@ def main() -> None:
         sys.exit(bool(failed))
     report = [sys.executable, str(Path(__file__).with_name("report.py")), "--out", str(args.out)]
     names = [variant.name for variant in variants]
-    if len(names) > 1 and not {"ppo", "acppo"} <= {*names}:
-        report += ["--baseline", names[0], "--challenger", *names[1:]]
+    baseline = "ppo" if "ppo" in names else names[0]
+    if others := [name for name in names if name != baseline]:
+        report += ["--baseline", baseline, "--challenger", *others]
     sys.exit(subprocess.run(report).returncode)
 
 

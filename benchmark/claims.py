@@ -14,11 +14,13 @@ claim's sign:
                      seeds), baseline - challenger
     own spikes       share of iterations with a KL above ten times the run's own median, baseline - challenger
     clip ratio       0.02 - |difference of the means of `losses/avg_clip_ratio`|, so above 0 if the challenger's is
-                     near the baseline's; of no pair in which the ranges of one do not clip
+                     near the baseline's; not for a variant whose ranges do not clip
 Over all pairs of all games, a claim is judged by Wilcoxon's signed-rank test of their margins: exact, that is over all
 2ⁿ assignments of signs, and two-sided. Equal sizes share their mean rank; a margin of 0 keeps its rank and counts for
 neither sign. A claim holds, or does not hold, at p ≤ 0.05; else the two cannot be told apart with these runs. With
-fewer than six pairs that is always so: p is at least 2 of 2ⁿ. On one game a claim holds if every margin is above 0, and
+fewer than six pairs that differ that is always so: p is at least 2 of 2ⁿ. Games without a human score are left out of
+the final scores' test. Each claim is judged by itself, and of the spikes above the baseline's percentile p says little,
+because that limit is fitted to the baseline. On one game a claim holds if every margin is above 0, and
 does not hold if every margin is below 0. With fewer than three pairs on the game the two cannot be told apart there: of
 two equal algorithms two pairs agree every second time, three still every fourth. Three pairs can never be below
 p = 0.25, so this is the weaker verdict. For unfinished runs it is too early to judge a final score. A KL below 1e-8 is
@@ -29,7 +31,8 @@ all runs of a game are cut at one step, not each pair at its own (when the seeds
 stages, and that final scores wait for 90 % of the schedule (when one pair had finished, in which ppo scores more). On
 2026-11-28, while 2 of the 15 pairs were finished (ppo scores more in both) and before the next had ended: the exact
 test took the place of the 95 % bootstrap interval of the interquartile mean, which excluded 0 for two equal algorithms
-one time in ten; and the clip ratio is held against the baseline's mean, pair by pair, no longer against its ε.
+one time in ten; six pairs in all took the place of three on every game; the clip ratio is held against the baseline's
+mean, pair by pair, no longer against its ε, and left out for variants that do not clip; the least KL is 1e-8.
 
 The size of an effect is the interquartile mean of all margins, which the test does not use. A plain mean is never used:
 the human score of DoubleDunk is 2.2 points above random.
@@ -168,12 +171,14 @@ def find_margins(stage: Stage, challenger: str) -> dict[str, dict[str, np.ndarra
             "clip ratio": [0.02 - abs(new.avg_clip_ratio.mean() - base.avg_clip_ratio.mean()) for base, new in both],
         }
         for claim, values in of_game.items():
-            margins.setdefault(claim, {})[game] = np.array([value for value in values if math.isfinite(value)])
+            known = [round(value, 12) for value in values if math.isfinite(value)]  # so that equal shares are equal
+            margins.setdefault(claim, {})[game] = np.array(known)
     return {claim: of_games for claim, of_games in margins.items() if any(map(len, of_games.values()))}
 
 
 def pool(claim: str, margins: dict[str, np.ndarray]) -> np.ndarray:
     """Returns all games' margins; scores of several games in units of human minus random score, where that is known."""
+    margins = {game: of_game for game, of_game in margins.items() if len(of_game)}
     comparable = claim != "score" or len(margins) < 2
     units = dict.fromkeys(margins, 1) if comparable else (PLAYED.human - PLAYED.random).to_dict()
     return np.concatenate([np.zeros(0), *(margins[game] / units[game] for game in margins if game in units)])
@@ -193,10 +198,11 @@ def judge(margins: np.ndarray) -> str:
     return HOLDS if total > 0 else FAILS
 
 
-def find_change(margins: np.ndarray) -> tuple[int, str]:
-    """Returns how few further pairs could change what `judge` says, and whether for or against the claim."""
-    decided, largest = signed_rank_test(margins)[1] <= LEVEL, 2 * np.abs(margins).max(initial=0.5)
-    for count, side in itertools.product(range(1, 1000), (1, -1)):
-        more = np.append(margins, [side * largest] * count)
-        if (signed_rank_test(more)[1] <= LEVEL) != decided:
-            return count, "for" if side > 0 else "against"
+def find_change(margins: np.ndarray) -> str:
+    """Says how few further pairs, larger than all others, could change what `judge` says."""
+    decided, largest = signed_rank_test(margins)[1] <= LEVEL, np.abs(margins).max(initial=0)
+    for count in itertools.count(1):
+        more = largest + np.arange(1, count + 1)
+        p = {side: signed_rank_test(np.append(margins, sign * more))[1] for side, sign in (("for", 1), ("against", -1))}
+        if changed := [f"all {side} it" for side in p if (p[side] <= LEVEL) != decided]:
+            return f"{count} or more further pairs, {' or '.join(changed)}"

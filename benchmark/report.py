@@ -39,10 +39,10 @@ CLAIM_TEXTS = {
     "KL": ("{new}'s KL between policy updates is smaller", ".2f", "{base}'s mean KL is {} times {new}'s"),
     "relative spikes": ("{new} has fewer KL spikes above the 99th percentile of {base}'s", "+.2%", "{} of iterations"),
     "own spikes": ("{new} has fewer KL spikes above ten times the run's own median", "+.2%", "{} of iterations"),
-    "clip ratio": ("{new}'s average clip ratio is within 0.02 of {base}'s", "+.4f", "{} inside the band"),
+    "clip ratio": ("{new}'s average clip ratio is within 0.02 of {base}'s", ".4f", "the means are {} apart"),
 }
-LEGEND = """✓ holds, ✗ does not hold, ? cannot be told apart with these runs. Too few are one or two pairs of a \
-game, since even three agree by chance every fourth time (p = 0.25), and fewer than six in all: p is at least 2 of 2ⁿ.
+LEGEND = """✓ holds, ✗ does not hold, ? cannot be told apart with these runs. Too few pairs are fewer than six that \
+differ (p is at least 2 of 2ⁿ); of one game, fewer than three (even three agree by chance every fourth time, p = 0.25).
 """
 
 
@@ -91,7 +91,7 @@ def score_table(curves: Curves) -> str:
             counts = f" (n = {len(final)}" + (f", {fewest} games)" if fewest < 100 else ")")
             row.append(score(final.mean(), final.std()) + (counts if len(final) else ""))
         rows.append([*row, *(score(claims.PLAYED[who].get(game, math.nan)) for who in ("random", "human"))])
-    title = "Mean of the last 100 games (of all, where a seed has ended fewer): mean ± sample deviation over n seeds"
+    title = "Mean of the last 100 games (of all, where a seed has ended fewer), ± sample deviation over n seeds"
     return titled(title, ["game", "agent steps", *variants(curves), "random", "human"], rows)
 
 
@@ -113,7 +113,8 @@ def atari5_table(curves: Curves) -> str:
         scores = pd.Series({game: curve.mean_return_100.iloc[-1] for game, curve in of_seed.items()})
         value = claims.atari5_score(scores.reindex(claims.ATARI_5.index))
         rows.append([variant, str(seed), f"needs {missing}" if missing else cell(value, ".1f")])
-    title = "Atari-5 score, an estimate of the median over 57 games in % of human play; its error is about 10 % of it"
+    title = "Atari-5 score, an estimate of the median over 57 games in % of human play. It was fitted on agents above "
+    title += "40 %, with an error of about 10 % of it"
     return titled(title, ["variant", "seed", "score"], rows)
 
 
@@ -128,7 +129,8 @@ def run_table(runs: Runs, curves: Curves) -> str:
         row += [f"{run['hours']['wall']:.1f}" if run["hours"] else "–"]
         rows.append([*row, re.sub(r"\b([0-9a-f]{7})[0-9a-f]{33}", r"\1", run["commit"])])
     hours = [run["hours"]["wall"] for run in runs.values() if run["hours"]]
-    title = f"What each run came to and cost; hours are known of {len(hours)} of {len(runs)}, {sum(hours):.1f} in all"
+    known = f"; hours are known of {len(hours)} of {len(runs)}, together {sum(hours):.1f}" if hours else ""
+    title = f"What each run came to and cost{known}"
     columns = ["game", "variant", "seed", "agent steps", "final score", "without learning", "mean KL", "machine"]
     return titled(title, [*columns, "hours", "commit"], rows)
 
@@ -174,12 +176,13 @@ def claims_tables(stage: Stage, challenger: str) -> tuple[str, str]:
     for claim, margins in claims.find_margins(stage, challenger).items():
         (sentence, form, unit), values = CLAIM_TEXTS[claim], claims.pool(claim, margins)
         sentence, judged, size = sentence.format(**called), claims.judge(values), claims.interquartile_mean(values)
-        number = format(math.exp(size) if claim == "KL" else size, form)  # a KL's margin is the log of a ratio
-        in_points = claim == "score" and len(margins) == 1
+        # A KL's margin is the log of a ratio, a clip ratio's is what the distance leaves of 0.02
+        number = format(math.exp(size) if claim == "KL" else 0.02 - size if claim == "clip ratio" else size, form)
+        in_points = claim == "score" and sum(len(of_game) > 0 for of_game in margins.values()) == 1
         effect = f"{score(size)} points" if in_points else unit.format(number, **called)
         pairs_for = f"{count(values)}, p = {claims.signed_rank_test(values)[1]:.2g}"
-        change = "{} or more further pairs, all {} it".format(*claims.find_change(values))
-        cells, by_game = [f"{SIGNS[judged]} {judged}", effect, pairs_for, change], map(game_verdict, margins.values())
+        cells = [f"{SIGNS[judged]} {judged}", effect, pairs_for, claims.find_change(values)]
+        by_game = map(game_verdict, margins.values())
         if claim == "score" and stage.name == "unfinished":
             cells, by_game = [TOO_EARLY, "–", "–", "finished runs"], [TOO_EARLY] * len(margins)
         elif not len(values):
@@ -246,13 +249,16 @@ def coverage(stage: Stage) -> str:
 
 def page_parts(stages: list[Stage], challengers: tuple[str, ...], prefix: str = "") -> dict[str, str]:
     """Returns what a page opens with, and its tables; `prefix` begins the names of its directories of figures."""
-    opening, results = [], [LEGEND]
+    opening, results = [], []
     for stage in stages:
         files = f"figures/{prefix}{stage.name}"
         score_figure, kl_figure, clip_figure = (f"![{FIGURES[name][0]}]({files}/{name}.png)\n" for name in FIGURES)
         verdicts, of_games = zip(*(claims_tables(stage, challenger) for challenger in challengers))
         results += [f"## {stage.name.capitalize()} runs\n", coverage(stage)]
-        (opening if stage is stages[0] else results).extend([*verdicts, score_figure])
+        if stage is stages[0]:
+            opening = [*verdicts, LEGEND, score_figure]
+        else:
+            results += [*verdicts, score_figure]
         results += [score_table(stage.compared), published_table(stage.compared)]
         results += [atari5_table(stage.compared)] if stage.name == "finished" else []
         results += [kl_figure, kl_table(stage), clip_figure, *of_games, progress_table(stage)]
@@ -272,7 +278,7 @@ def main() -> None:
     parts = page_parts(stages, args.challenger, prefix)
     parts["results"] += f"\n## All runs\n\n{run_table(runs, curves)}"
     write_parts(args.out / f"{args.note or 'README'}.md", **parts)
-    if args.out.resolve() == DEFAULT_OUT and (args.note, args.baseline, args.challenger) == ("", "ppo", ("acppo",)):
+    if args.out.resolve() == DEFAULT_OUT and (args.note, args.baseline) == ("", "ppo"):
         write_parts(ROOT / "README.md", results=short_table(stages))
     for stage in stages:
         draw(stage, args.out / "figures" / f"{prefix}{stage.name}")

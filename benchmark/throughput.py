@@ -64,11 +64,11 @@ class Args:
     """iterations before the window, in which memory and caches settle"""
     window: PositiveInt = 30
     """iterations that are measured"""
-    threads: tuple[int, ...] = (available_cores(),)
+    threads: tuple[PositiveInt, ...] = (available_cores(),)
     """threads of a candidate, over all its jobs; several values give a row each, as for the next two"""
-    jobs: tuple[int, ...] = (1,)
+    jobs: tuple[PositiveInt, ...] = (1,)
     """processes that a candidate is run as at once, with threads / jobs each, at least 1"""
-    num_envs: tuple[int, ...] = (8,)
+    num_envs: tuple[PositiveInt, ...] = (8,)
     """environments that a process plays at once"""
     peer: bool = False
     """measure Stable-Baselines3's PPO too (`pip install -e '.[peer]'`)"""
@@ -83,7 +83,6 @@ class Args:
         """Returns (argument, does it hold, advice) for each rule that its type does not say."""
         _, sticky = find_atari_game(self.env_id) or ("", 1.0)
         return [
-            *((name, min(getattr(self, name)) > 0, "give numbers above 0") for name in ("threads", "jobs", "num_envs")),
             ("candidates", bool(self.candidates), "name a script, for example ppo_atari.py"),
             ("env_id", not sticky or not (self.peer or self.cleanrl), "peers need a game such as Breakout"),
             ("cleanrl", not self.cleanrl or (self.cleanrl / CLEANRL).is_file(), f"there is no {CLEANRL} in it"),

@@ -98,9 +98,14 @@ def checkpoint_of(run_dir: Path) -> dict:
 
 
 # ------------------------------------------------------------------------------------------------------ in this process
+@contextlib.contextmanager
 def open_run(script, path):
     """Holds a run's directory for the body of a `with`."""
-    return contextlib.closing(script.RunDirectory(str(path)))
+    run = script.RunDirectory(str(path))
+    try:
+        yield run
+    finally:
+        run.lock.release()
 
 
 def train(script, run_dir, **arguments) -> dict[str, list[tuple[int, float]]]:
@@ -157,7 +162,7 @@ def call_main(monkeypatch, capfd, tmp_path):
                 status = ended.code or 0
             finally:
                 for run in opened:
-                    run.close()
+                    run.lock.release()
                 for number, handler in handlers.items():
                     signal.signal(number, handler)
         out, err = capfd.readouterr()

@@ -283,7 +283,7 @@ def test_game_of_another_spelling_finds_its_own_runs(tmp_path, call):
         ("--variants mine=my_ppo.py 'mine=my_ppo.py --clip-coef 0.2'", "give each variant another name"),
         ("--variants mine=raises.py", "ZeroDivisionError"),
         ("--games Combat", "no mode for one player"),
-        (f"--seeds {2**63}", "from 0 to 2^63 - 1"),
+        (f"--seeds {2**63}", "give a value in 0..2^63-1"),
         ("--cpus-per-run 3 --cores 2", "the grid has 2 cores"),
         ("--address nonsense", "Ray does not start"),
         (f"--out {Args.out} --games Qbert Pong", "is for the thesis's games, variants and length"),
@@ -369,15 +369,21 @@ def test_script_edited_while_the_grid_runs_starts_no_run(my_ppo, tmp_path, monke
     assert "my_ppo.py has been edited since this call began" in atari5.train(run)
 
 
-@pytest.mark.parametrize("variants", ["mine ppo product", "mine acppo ppo", "mine"])
-def test_report_of_acppo_or_of_all_against_the_first_if_no_run_failed(variants, my_ppo, tmp_path, call, monkeypatch):
+@pytest.mark.parametrize(
+    ("variants", "compared"),
+    [
+        ("mine acppo ppo", ["--baseline", "ppo", "--challenger", "mine", "acppo"]),
+        ("product mine", ["--baseline", "product", "--challenger", "mine"]),
+        ("mine", []),
+    ],
+)
+def test_report_is_on_all_against_one_if_no_run_failed(variants, compared, my_ppo, tmp_path, call, monkeypatch):
     called, make, of_run = [], atari5.make_run, {"state": "done"}
     monkeypatch.setattr(subprocess, "run", lambda words: called.extend(words) or subprocess.CompletedProcess(words, 0))
     monkeypatch.setattr(atari5, "make_run", lambda *words: dataclasses.replace(make(*words), **of_run))
     flags = ("--out", "out", "--games", "Qbert", "--variants", *variants.replace("mine", "mine=my_ppo.py").split())
     assert call(*flags)[0] == 0
-    others = ["--baseline", "mine", "--challenger", "ppo", "product"] if variants == "mine ppo product" else []
-    assert called[1:] == [str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out"), *others]
+    assert called[1:] == [str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out"), *compared]
     called.clear()
     of_run |= {"state": "failed", "reason": "a reason"}
     assert call(*flags)[0] == 1 and not called

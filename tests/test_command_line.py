@@ -1,6 +1,5 @@
 """The scripts as a user runs them: smoke runs as processes, their curves, and refusals of bad input."""
 
-import contextlib
 import json
 import math
 import re
@@ -80,8 +79,7 @@ def test_two_runs_that_start_in_one_second_get_two_directories(script, env_id, n
     monkeypatch.setattr(time, "time", lambda: 1234567890.5)
     args, names = script.Args(env_id=env_id, log_dir=str(tmp_path / "runs")), []
     for _ in range(3):
-        with contextlib.closing(script.RunDirectory.make(args)) as run:
-            names.append(Path(run.path).name)
+        names.append(Path(script.RunDirectory.make(args).path).name)
     assert names == [f"{name}__{args.exp_name}__1__{second}" for second in (1234567890, 1234567891, 1234567892)]
 
 
@@ -93,10 +91,11 @@ def test_the_recorded_command_is_parsed_to_the_same_arguments():
 
 
 def test_lists_tuples_and_paths_of_a_script_are_recorded_and_resumed(script, tmp_path, call_main):
-    fields = '    sizes: tuple[int, ...] = (3, 4)\n    files: tuple[Path, ...] = ()\n    data: Path = Path("x")\n'
+    fields = '    sizes: tuple[PositiveInt, ...] = (3,)\n    files: tuple[Path, ...] = ()\n    data: Path = Path("x")\n'
     text = Path(script.__file__).read_text(encoding="utf-8").replace("    num_envs: ", f"{fields}    num_envs: ", 1)
     (tmp_path / "my_ppo.py").write_text(text, encoding="utf-8")
     mine = load(tmp_path / "my_ppo.py")
+    assert call_main(mine, "--sizes", "5", "0").err == "--sizes (5, 0): give a value in 1..10^12\n"
     given = ["--sizes", "5", "6", "7", "--files", "a", "b c", "--data", "d e/f"]
     call_main(mine, *flags_of(env_id=SHORT_CARTPOLE, **SMALL, total_timesteps=256, stop_at=128), *given)
     run_dir = run_dir_in(tmp_path / "runs")

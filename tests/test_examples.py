@@ -82,14 +82,13 @@ def test_the_placebos_ranges_are_acppos_dealt_out_anew(examples):
         assert (one == other).sum() < 10  # a random permutation of any number leaves one, on average, where it is
 
 
-@pytest.mark.parametrize(("c", "equal"), [(0.0, True), (1.0, False)])
-def test_the_placebo_trains_as_acppo_bit_for_bit_if_all_ranges_are_equal(examples, c, equal, tmp_path):
+def test_the_placebo_trains_as_acppo_bit_for_bit_if_all_ranges_are_equal(examples, tmp_path):
     ends = []
     for script in (acppo_atari, examples["placebo"]):
         run_dir = tmp_path / script.__name__
-        logged = reproducible(train(script, run_dir, **PIXELS, c=c, learning_rate=0.01))
+        logged = reproducible(train(script, run_dir, **PIXELS, c=0, learning_rate=0.01))
         ends.append((logged, [parameter.tolist() for parameter in checkpoint_of(run_dir)["agent"].values()]))
-    assert (ends[0] == ends[1]) == equal
+    assert ends[0] == ends[1]
 
 
 def pytest_on(script: Path, *selection: str) -> subprocess.CompletedProcess:

@@ -179,7 +179,6 @@ def test_interquartile_mean_weighs_borders_by_their_part_inside():
 
 
 def test_signed_rank_p_is_the_share_of_all_assignments_of_signs():
-    assert claims.signed_rank_test(np.arange(1.0, 7))[1] == 2 / 64
     by_hand = {(5.0, -1, 2, 2, -9): (4, 1, 2.5, 2.5, 5), (0.0, 0, -3, 7, 7, 7, 9): (1.5, 1.5, 3, 5, 5, 5, 7)}
     for margins, ranks in by_hand.items():
         ways = itertools.product((-1, 1), repeat=len(ranks))
@@ -201,7 +200,10 @@ def test_a_shift_of_one_deviation_is_found_with_15_pairs():
 
 
 def test_the_fewest_pairs_that_change_a_verdict_are_as_counted_by_hand():
-    known = {(): (6, "for"), (-1, -2): (4, "against"), (*range(1, 16),): (3, "against")}  # 2 × 16.5 < 34, 3 × 17 > 40
+    known = {(): "6 or more further pairs, all for it or all against it"}
+    known |= {(-1, -2): "4 or more further pairs, all against it"}
+    # Of 17 pairs the lesser ranks may sum to 34, of 18 to 40 (tables of the test): 16 + 17 is below, 16 + 17 + 18 above
+    known |= {(*range(1, 16),): "3 or more further pairs, all against it"}
     for margins, change in known.items():
         assert claims.find_change(np.array(margins)) == change
 
@@ -224,7 +226,7 @@ def test_the_table_of_runs_says_what_is_known_of_each():
     curve = pd.DataFrame({"mean_return_100": [1, 12345.6], "kl": [0.1, 0.3]})
     text = report.run_table(records, dict.fromkeys(records, curve))
     rows = [row[5:] for row in cells(text)[2:]]
-    assert "12,345.6" in text and "known of 1 of 2, 2.0 in all" in text and rows[1] == ["–", "0.2", "2 cores", "–", ""]
+    assert "12,345.6" in text and "of 1 of 2, together 2.0" in text and rows[1] == ["–", "0.2", "2 cores", "–", ""]
     assert rows[0] == ["8.50 ± 0.50 (n = 30)", "0.2", "2 cores, AVX2; 4 cores, bf16", "2.0", "aaaaaaa; bbbbbbb-dirty"]
 
 

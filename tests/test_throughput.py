@@ -121,7 +121,7 @@ def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatc
         ([], "name a script"),
         (["no_such.py"], "no such script"),
         (["script.py --threads 1"], "leave out --threads"),
-        (["script.py", "--jobs", "1", "0"], "--jobs (1, 0): give numbers above 0"),
+        (["script.py", "--jobs", "1", "0"], "--jobs (1, 0): give a value in 1..10^12"),
         (["script.py", "--window", "0"], "--window 0: give "),
         (["script.py", "--env-id", "ALE/Breakout-v5", "--peer"], "a game such as Breakout"),
         (["script.py", "--cleanrl", "."], "there is no cleanrl/ppo_atari.py in it"),

@@ -198,7 +198,7 @@ class Awkward(gym.Env):
                 sys.exit()
             Path("step-100").touch()
         result = self.observe(), 1.0, self.steps % 10 == 0, False, {}
-        return result[:4] if self.trait == "is old" else result
+        return (*result[:3], {"lives": 3}) if self.trait == "is old" else result
 
     def render(self):
         self.renders += 1
@@ -217,7 +217,7 @@ class Awkward(gym.Env):
 
 TRAITS = ["takes signals", "forks", "draws globally", "raises", "exits", "leaves", "is old", "renders no more"]
 for trait in [*TRAITS, "does not close", "exists once"]:
-    gym.register(f"{trait.title().replace(' ', '')}-v0", Awkward, kwargs={"trait": trait})
+    gym.register(f"{trait.title().replace(' ', '')}-v0", Awkward, disable_env_checker=True, kwargs={"trait": trait})
 gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})
 gym.register("CannotBeReset-v0", CannotStart, kwargs={"fails_in": "reset"})
 gym.register("CountsFromFive-v0", CountsFromFive)

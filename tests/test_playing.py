@@ -226,7 +226,7 @@ def test_the_run_directory_says_how_to_repeat_the_run(script, tmp_path, call_mai
     about = json.loads((run_dir / "args.json").read_text())
     assert about["started_at_step"] == 0
     assert about["args"]["gamma"] == 0.9 and about["args"]["norm_adv"] is False
-    assert about["provenance"]["torch"].startswith("2.13.0") and len(about["provenance"]["commit"]) >= 16
+    assert about["provenance"]["torch"].startswith("2.13.0") and about["provenance"]["commit"]
     python, name, *words = shlex.split(about["command"])
     assert (python, name) == ("python", Path(script.__file__).name)
     assert call_main(script, *words, "--log-dir", "again").status == 0

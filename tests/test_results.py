@@ -245,6 +245,12 @@ def test_a_kl_of_0_or_below_by_rounding_gives_no_verdict_and_can_be_drawn(tmp_pa
         figures.draw(stage, tmp_path)
 
 
+def test_a_pair_has_game_and_seed_in_common():
+    final = {("ppo", "Pong", 1): 1, ("ppo", "Pong", 2): 2, ("acppo", "Pong", 2): 5, ("acppo", "Pong", 3): 9}
+    (stage,) = make_stages({key: {"mean_return_100": [score]} for key, score in final.items()})
+    assert list(claims.find_margins(stage, "acppo")["score"]["Pong"]) == [3]
+
+
 def test_stages_compare_each_game_at_one_step():
     pong = {("ppo", "Pong", 1): 100, ("acppo", "Pong", 1): 90, ("ppo", "Pong", 2): 88, ("acppo", "Pong", 2): 44}
     lengths = {("ppo", "Qbert", 1): 3, **pong, ("ppo", "Pong", 3): 43}

@@ -20,11 +20,11 @@ Over all pairs of all games, a claim is judged by Wilcoxon's signed-rank test of
 neither sign. A claim holds, or does not hold, at p ≤ 0.05; else the two cannot be told apart with these runs. With
 fewer than six pairs that differ that is always so: p is at least 2 of 2ⁿ. Games without a human score are left out of
 the final scores' test. Each claim is judged by itself, and of the spikes above the baseline's percentile p says little,
-because that limit is fitted to the baseline. On one game a claim holds if every margin is above 0, and
-does not hold if every margin is below 0. With fewer than three pairs on the game the two cannot be told apart there: of
-two equal algorithms two pairs agree every second time, three still every fourth. Three pairs can never be below
-p = 0.25, so this is the weaker verdict. For unfinished runs it is too early to judge a final score. A KL below 1e-8 is
-a 0 with the rounding errors of float32, and counts as 1e-8.
+because that limit is fitted to the baseline. On one game a claim holds if every margin is above 0, and does not hold if
+every margin is below 0. With fewer than three pairs on the game the two cannot be told apart there: of two equal
+algorithms two pairs agree every second time, three still every fourth. Three pairs can never be below p = 0.25, so this
+is the weaker verdict. For unfinished runs it is too early to judge a final score. A KL below 1e-8 is a 0 with the
+rounding errors of float32, and counts as 1e-8.
 
 This rule was committed eight minutes into the first two of the runs (8073f69), before any had ended. Added since: that
 all runs of a game are cut at one step, not each pair at its own (when the seeds had come to different lengths); the

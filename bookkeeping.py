@@ -62,7 +62,7 @@ def available_cores() -> int:
 
 def print_message(text: str, end: str = "\n", descriptor: int = 2) -> None:
     """Writes to standard error, or output, and ignores errors: a closed terminal or a full disk must not end a run."""
-    start = "\r\x1b[K" if os.isatty(2) else ""  # over the status line
+    start = "\r\x1b[K" if os.isatty(descriptor) else ""  # over the status line
     with contextlib.suppress(OSError):  # not `print`, which a signal's handler must not call
         os.write(descriptor, f"{start}{text}{end}".encode(errors="replace"))
 
@@ -504,7 +504,7 @@ class StopSignal:
             signal.signal(number, signal.SIG_DFL)
             os.kill(os.getpid(), number)
         elif not self.number:
-            self.number, self.since = number, time.monotonic()
+            self.since, self.number = time.monotonic(), number
             print_message("Stopping cleanly; another signal, at least a second from now, ends at once")
         elif time.monotonic() - self.since >= 1:
             os._exit(128 + number)  # not by SIG_DFL, which the kernel ignores for process 1 of a container

@@ -267,7 +267,8 @@ def page_parts(stages: list[Stage], challengers: tuple[str, ...], prefix: str = 
 
 def main() -> None:
     args = tyro.cli(Args, description=__doc__)
-    collect.collect(args.out, args.training_directories, args.note)
+    # A run that is new and not named belongs to the set without a note
+    collect.collect(args.out, args.training_directories, args.note if args.training_directories else "")
     runs, curves = collect.read_runs(args.out, args.note)
     if not runs:
         usage_error(f"--out {args.out}", f"no run there has {f'the note {args.note}' if args.note else 'no note'}")

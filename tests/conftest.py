@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import NamedTuple
@@ -97,6 +96,12 @@ def checkpoint_of(run_dir: Path) -> dict:
     return torch.load(run_dir / "checkpoint.pt", weights_only=True)
 
 
+def cells(markdown: str) -> list[list[str]]:
+    """The cells of the tables in a text, row by row."""
+    lines = [line for line in markdown.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
 # ------------------------------------------------------------------------------------------------------ in this process
 @contextlib.contextmanager
 def open_run(script, path):
@@ -137,7 +142,7 @@ class Ended(NamedTuple):
 
 @pytest.fixture
 def call_main(monkeypatch, capfd, tmp_path):
-    """Calls a script's `main` in this process, which stays as it was, from the test's own directory."""
+    """Calls the `main` of a script, or a command, in this process, which stays as it was, from the test's directory."""
     monkeypatch.chdir(tmp_path)
 
     def call(script, *flags: str) -> Ended:
@@ -180,9 +185,8 @@ def environment(directory: Path = ROOT / "tests", **variables: str) -> dict[str,
 class Process(subprocess.Popen):
     """A script as a user starts it, with the tests' environments importable."""
 
-    def __init__(self, script, *flags: str, cwd: Path, before: Sequence[str] = (), file_size: int | None = None):
-        """Starts it by the command `before`, if any; no file that it writes can grow beyond `file_size` bytes, as if
-        the disk were full."""
+    def __init__(self, script, *flags: str, cwd: Path, file_size: int | None = None):
+        """Starts it; no file that it writes can grow beyond `file_size` bytes, as if the disk were full."""
 
         def prepare() -> None:
             signal.signal(signal.SIGINT, signal.SIG_DFL)  # which a suite in the background of a script ignores
@@ -191,7 +195,7 @@ class Process(subprocess.Popen):
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, file_size))
 
         super().__init__(
-            [*before, sys.executable, script.__file__, *flags],
+            [sys.executable, script.__file__, *flags],
             cwd=cwd,
             env=environment(),
             stdout=subprocess.PIPE,

@@ -122,19 +122,6 @@ def grid(tmp_path_factory, start):
     return out, said, goal, again
 
 
-@pytest.fixture
-def call(monkeypatch, capfd):
-    """Calls the grid's `main` in this process, if it starts no run: (exit status, stdout, stderr)."""
-
-    def call_main(*flags: str) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", ["atari5.py", *flags])
-        with pytest.raises(SystemExit) as ended:
-            atari5.main()
-        return ended.value.code, *capfd.readouterr()
-
-    return call_main
-
-
 def test_interrupted_grid_leaves_every_run_at_its_last_step(grid):
     out, said, _, _ = grid
     assert "resume with the same command" in said
@@ -155,11 +142,11 @@ def test_failing_run_is_tried_twice_and_reported_after_the_rest(grid):
     assert "1 of 2 runs are done" in again.stderr
 
 
-def test_finished_run_is_skipped_without_a_trace(grid, call):
+def test_finished_run_is_skipped_without_a_trace(grid, call_main):
     out, _, goal, _ = grid
     before = {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*.*")}
     flags = ("--games", "CartPole-v1", "--variants", "ppo", "--stop-at", str(goal))
-    assert call(*GRID, "--out", str(out), *flags) == (0, "", f"1 of 1 runs are done, in {out}\n")
+    assert call_main(atari5, *GRID, "--out", str(out), *flags) == (0, "", f"1 of 1 runs are done, in {out}\n")
     assert before == {path: (path.stat().st_mtime_ns, path.stat().st_size) for path in out.rglob("*.*")}
 
 
@@ -255,9 +242,9 @@ def saved_run(out: Path, step: int, variant: str = "ppo", **trained) -> atari5.R
     return make_run(variant, out)
 
 
-def test_dry_run_prints_commands_seed_by_seed_and_starts_nothing(tmp_path, call):
+def test_dry_run_prints_commands_seed_by_seed_and_starts_nothing(tmp_path, call_main):
     flags = ["--games", "phoenix", "Qbert", "--seeds", "1", "2", "2", "--stop-at", "5000", "--bf16", "--dry-run"]
-    status, printed, said = call(*flags, "--total-timesteps", "9000", "--out", str(tmp_path / "out"))
+    status, printed, said = call_main(atari5, *flags, "--total-timesteps", "9000", "--out", str(tmp_path / "out"))
     assert (status, said) == (0, "") and not (tmp_path / "out").exists()
     names = [line.split(":")[0] for line in printed.splitlines()]
     assert names == [f"{g}__{v}__{s}" for s in (1, 2) for g in ("Phoenix", "Qbert") for v in ("ppo", "acppo")]
@@ -265,9 +252,11 @@ def test_dry_run_prints_commands_seed_by_seed_and_starts_nothing(tmp_path, call)
     assert printed.count("--total-timesteps 9000 --bf16 --threads 1 --eval-episodes 0 --stop-at 5000") == 8
 
 
-def test_game_of_another_spelling_finds_its_own_runs(tmp_path, call):
+def test_game_of_another_spelling_finds_its_own_runs(tmp_path, call_main):
     saved_run(tmp_path, 1024)
-    _, printed, _ = call(*ONE_RUN, "--games", "qbert", "QBERT", "--out", str(tmp_path), "--dry-run", "--bf16")
+    _, printed, _ = call_main(
+        atari5, *ONE_RUN, "--games", "qbert", "QBERT", "--out", str(tmp_path), "--dry-run", "--bf16"
+    )
     assert printed.startswith("Qbert__ppo__1: unfinished, step 1,024: ") and printed.count("\n") == 1
     assert f"--resume {tmp_path / 'training' / 'Qbert__ppo__1__1700000000'}" in printed and "--bf16" not in printed
 
@@ -291,26 +280,26 @@ def test_game_of_another_spelling_finds_its_own_runs(tmp_path, call):
         (f"--out {Args.out} --variants my=my_ppo.py", "is for the thesis's games, variants and length"),
     ],
 )
-def test_what_cannot_be_trained_is_refused_in_one_line(flags, said, my_ppo, call):
+def test_what_cannot_be_trained_is_refused_in_one_line(flags, said, my_ppo, call_main):
     my_ppo.with_name("raises.py").write_text("1 / 0")
-    status, printed, err = call("--out", "out", *shlex.split(flags))
+    status, printed, err = call_main(atari5, "--out", "out", *shlex.split(flags))
     *before, last = err.splitlines()
     assert (status, printed) == (2, "") and said in last and last.startswith(flags.split()[0])
     assert not before or "SystemExit" in last
 
 
 @pytest.mark.parametrize(("source", "status"), [("Qbert__ppo__1__1700000000", 0), ("Qbert__ppo__1__1600000000", 2)])
-def test_run_directory_of_another_training_is_refused_at_once(source, status, tmp_path, call):
+def test_run_directory_of_another_training_is_refused_at_once(source, status, tmp_path, call_main):
     record = tmp_path / "runs" / saved_run(tmp_path, 1024).name / "run.json"
     record.parent.mkdir(parents=True)
     record.write_text(json.dumps({"source": source}))
     flags = (*ONE_RUN, "--out", str(tmp_path), "--dry-run")
-    assert call(*flags)[0] == status and call(*flags, "--no-figures")[0] == 0
+    assert call_main(atari5, *flags)[0] == status and call_main(atari5, *flags, "--no-figures")[0] == 0
 
 
 @pytest.mark.parametrize(("seeds", "said"), [(("2",), "--seeds 2: this is one seed, number 2\n"), (("1", "2"), "")])
-def test_one_seed_is_not_taken_for_a_number_of_seeds(seeds, said, tmp_path, call):
-    assert call("--seeds", *seeds, "--out", str(tmp_path), "--dry-run")[2] == said
+def test_one_seed_is_not_taken_for_a_number_of_seeds(seeds, said, tmp_path, call_main):
+    assert call_main(atari5, "--seeds", *seeds, "--out", str(tmp_path), "--dry-run")[2] == said
 
 
 def test_progress_is_what_a_run_has_said_since_its_start(tmp_path):
@@ -339,12 +328,14 @@ def test_run_is_done_at_the_last_whole_rollout_or_at_stop_at(tmp_path):
 
 
 # --------------------------------------------------------------------------------------------------- your own script
-def test_own_script_is_read_without_a_trace_and_may_import(my_ppo, call):
+def test_own_script_is_read_without_a_trace_and_may_import(my_ppo, call_main):
     script = my_ppo.rename(my_ppo.with_name("my ppo"))  # a script may have any name
     script.write_text(script.read_text().replace("import math\n", "import math\nimport helper\n"))
     script.with_name("helper.py").touch()
     variant = "mine='my ppo' --clip-coef 0.2"
-    status, printed, _ = call("--games", "Pong", "--out", "out", "--dry-run", "--variants", variant, variant)
+    status, printed, _ = call_main(
+        atari5, "--games", "Pong", "--out", "out", "--dry-run", "--variants", variant, variant
+    )
     assert status == 0 and printed.count(f"{shlex.quote(str(script))} --clip-coef 0.2 --env-id Pong") == 3  # seeds
     assert not list(my_ppo.parent.glob("__pycache__/my*")) and not (my_ppo.parent / "out").exists()
 
@@ -377,13 +368,13 @@ def test_script_edited_while_the_grid_runs_starts_no_run(my_ppo, tmp_path, monke
         ("mine", []),
     ],
 )
-def test_report_is_on_all_against_one_if_no_run_failed(variants, compared, my_ppo, tmp_path, call, monkeypatch):
+def test_report_is_on_all_against_one_if_no_run_failed(variants, compared, my_ppo, tmp_path, call_main, monkeypatch):
     called, make, of_run = [], atari5.make_run, {"state": "done"}
     monkeypatch.setattr(subprocess, "run", lambda words: called.extend(words) or subprocess.CompletedProcess(words, 0))
     monkeypatch.setattr(atari5, "make_run", lambda *words: dataclasses.replace(make(*words), **of_run))
     flags = ("--out", "out", "--games", "Qbert", "--variants", *variants.replace("mine", "mine=my_ppo.py").split())
-    assert call(*flags)[0] == 0
+    assert call_main(atari5, *flags)[0] == 0
     assert called[1:] == [str(ROOT / "benchmark" / "report.py"), "--out", str(tmp_path / "out"), *compared]
     called.clear()
     of_run |= {"state": "failed", "reason": "a reason"}
-    assert call(*flags)[0] == 1 and not called
+    assert call_main(atari5, *flags)[0] == 1 and not called

@@ -2,25 +2,10 @@
 
 import math
 import subprocess
-import sys
 
 import pytest
 
 from benchmark import match
-
-
-@pytest.fixture
-def call(monkeypatch, capfd):
-    """Calls the command in this process: (status or message, stdout, stderr)."""
-
-    def call_main(*flags: str) -> tuple[int | str, str, str]:
-        monkeypatch.setattr(sys, "argv", ["match.py", *flags])
-        try:
-            return match.main() or 0, *capfd.readouterr()
-        except SystemExit as ended:
-            return ended.code, *capfd.readouterr()
-
-    return call_main
 
 
 @pytest.mark.parametrize(
@@ -38,7 +23,7 @@ def test_interpolation_finds_a_match_if_there_is_one(means, wanted, rises, found
 
 
 @pytest.mark.parametrize("on", ["clipfrac", "kl"])
-def test_search_trains_matched_variant_and_the_other_at_each_bound(on, call, monkeypatch):
+def test_search_trains_matched_variant_and_the_other_at_each_bound(on, call_main, monkeypatch):
     matched, tried, _, _, rises = match.SEARCHES[on]
 
     def train(curve, *command):
@@ -50,25 +35,25 @@ def test_search_trains_matched_variant_and_the_other_at_each_bound(on, call, mon
 
     monkeypatch.setattr(match, "mean_over_training", train)
     flags = ("--on", on, *"--iterations 3 --bounds 0.06 0.04 --bf16 --games Pong".split())
-    status, out, _ = call(*flags)
+    status, out, _ = call_main(match, *flags)
     assert status == 0 and out.splitlines()[2].endswith("| 0.0500 |") and out.endswith(" = 0.0500\n")
-    status, out, _ = call(*flags, "Qbert")
+    status, out, _ = call_main(match, *flags, "Qbert")
     assert status.startswith("Qbert: no match between the tried bounds") and "| Qbert | 0.2 | 0.2 | 0.2 | nan |" in out
 
 
-def test_one_bound_is_refused_and_a_failing_script_ends_the_search(call, monkeypatch, tmp_path):
-    assert call("--on", "kl", "--bounds", "0.1")[0] == 2
+def test_one_bound_is_refused_and_a_failing_script_ends_the_search(call_main, monkeypatch, tmp_path):
+    assert call_main(match, "--on", "kl", "--bounds", "0.1")[0] == 2
     (tmp_path / "acppo_atari.py").write_text("import sys; sys.exit(3)")
     monkeypatch.setattr(match, "ROOT", tmp_path)
     with pytest.raises(subprocess.CalledProcessError, match="status 3"):
-        call("--on", "kl")
+        call_main(match, "--on", "kl")
 
 
 @pytest.mark.slow
-def test_tight_bound_clips_more_and_moves_the_policy_less(call):
+def test_tight_bound_clips_more_and_moves_the_policy_less(call_main):
     for on, bounds in (("clipfrac", ("1e-4", "10")), ("kl", ("1e-4", "0.9"))):
         flags = ("--games", "CartPole-v1", "--iterations", "2", "--jobs", "2")
-        status, out, said = call("--on", on, *flags, "--bounds", *bounds)
+        status, out, said = call_main(match, "--on", on, *flags, "--bounds", *bounds)
         _, _, tight, wide, bound = (cell.strip() for cell in out.splitlines()[2].strip("|").split("|"))
         assert status == 0 and (float(tight) > float(wide)) == (on == "clipfrac"), said
         assert float(bounds[0]) < float(bound) <= float(bounds[1])

@@ -1,6 +1,5 @@
 """The pure functions of the scripts, against brute force, closed forms and numbers worked out by hand."""
 
-import inspect
 import math
 
 import numpy as np
@@ -38,35 +37,6 @@ def test_gae_matches_the_brute_force_sum(each_script):
     assert np.allclose(computed, brute_force_gae(*arrays, gamma=0.9, gae_lambda=0.8), atol=1e-12)
 
 
-def constant_rollout(reward: float, value: float, num_steps: int):
-    never = torch.zeros(num_steps, 1, dtype=torch.bool)
-    full = torch.full((num_steps, 1), 1.0, dtype=torch.float64)
-    return reward * full, value * full, value * full, never, never
-
-
-@pytest.mark.thesis("compute_gae")
-def test_gae_of_reward_one_and_value_zero_is_a_geometric_sum(each_script):
-    gamma, gae_lambda, num_steps = 0.99, 0.95, 50
-    advantages = each_script.compute_gae(*constant_rollout(1.0, 0.0, num_steps), gamma, gae_lambda)
-    for steps_left in range(1, num_steps + 1):
-        expected = (1 - (gamma * gae_lambda) ** steps_left) / (1 - gamma * gae_lambda)
-        assert advantages[num_steps - steps_left].item() == pytest.approx(expected)
-
-
-@pytest.mark.thesis("compute_gae")
-def test_gae_of_the_true_value_is_zero(each_script):
-    advantages = each_script.compute_gae(*constant_rollout(1.0, 1 / (1 - 0.9), 50), 0.9, 0.95)
-    assert advantages.abs().max() < 1e-12
-
-
-@pytest.mark.thesis("compute_gae")
-def test_gae_is_the_same_for_whole_number_rewards_of_any_dtype(each_script):
-    rewards, never = torch.tensor([[1], [0], [-1]]), torch.zeros(3, 1, dtype=torch.bool)
-    values = torch.tensor([[0.3], [0.2], [0.1]])
-    both = [each_script.compute_gae(r, values, values, never, never, 0.9, 0.8) for r in (rewards, rewards.float())]
-    assert torch.equal(*both) and both[0].abs().min() > 0.01
-
-
 def test_the_clip_range_of_ppo_is_epsilon_whatever_the_advantage():
     assert ppo_atari.clip_range(torch.tensor([-3.0, 0.0, 2.0]), 0.1).tolist() == pytest.approx([0.1] * 3)
 
@@ -75,12 +45,6 @@ def test_the_clip_range_of_acppo_follows_the_formula():
     advantages = torch.tensor([-3.0, 0.0, 1.0, 0.5])
     clip = acppo_atari.clip_range(advantages, 0.16, 2.0)
     assert clip.tolist() == pytest.approx([0.16 / 7, 0.16, 0.16 / 3, 0.08])
-
-
-def test_the_clip_range_at_c_zero_is_ppos_to_the_bit():
-    advantages = torch.randn(1000, generator=torch.Generator().manual_seed(1))
-    for epsilon in (0.1, 0.16, 0.2):
-        assert torch.equal(acppo_atari.clip_range(advantages, epsilon, 0.0), ppo_atari.clip_range(advantages, epsilon))
 
 
 def test_the_clip_range_at_c_infinite_is_delta_over_the_advantage():
@@ -129,35 +93,15 @@ def test_a_large_c_approaches_the_product_only_objective():
     assert torch.allclose(nearby, at_infinity, atol=1e-3)
 
 
-def gradients_of_the_surrogate(script):
-    """Of ratios from 0.02 to 3 (row 49 is 1) at two clip ranges and advantages of both signs, with all of these."""
-    ratio, clip, advantages = torch.meshgrid(
-        torch.arange(1, 151, dtype=torch.float64) / 50,
-        torch.tensor([0.05, 0.3], dtype=torch.float64),
-        torch.tensor([-2.0, -0.5, 0.5, 2.0], dtype=torch.float64),
-        indexing="ij",
-    )
-    flat_ratio = ratio.flatten().requires_grad_()
-    given = flat_ratio, advantages.flatten(), clip.flatten()
-    try:
-        inspect.signature(script.surrogate).bind(*given)
-    except TypeError as error:
-        pytest.skip(f"its surrogate takes other arguments ({error})")
-    objective = script.surrogate(*given)
-    return torch.autograd.grad(objective.sum(), flat_ratio)[0].reshape(ratio.shape), ratio, advantages
-
-
 def test_a_policy_that_has_not_moved_gets_the_policy_gradient(each_script):
     """At ρ = 1 it is Â, for PPO and all its kin: they differ in how they brake from there on."""
-    gradient, ratio, advantages = gradients_of_the_surrogate(each_script)
-    assert (ratio[49] == 1).all() and torch.allclose(gradient[49], advantages[49], atol=1e-12)
-
-
-def test_a_ratio_that_has_moved_is_pushed_on_no_harder_than_at_one(each_script):
-    gradient, ratio, advantages = gradients_of_the_surrogate(each_script)
-    moved = (ratio - 1) * advantages > 0
-    assert moved.sum() == 4 * (100 + 49)
-    assert (gradient * advantages.sign() <= advantages.abs() + 1e-12)[moved].all()
+    ratio, advantages = torch.ones(4, requires_grad=True), torch.tensor([-2.0, -0.5, 0.5, 2.0])
+    try:
+        objective = each_script.surrogate(ratio, advantages, torch.tensor([0.05, 0.3, 0.05, 0.3]))
+    except TypeError as error:
+        pytest.skip(f"its surrogate takes other arguments ({error})")
+    (gradient,) = torch.autograd.grad(objective.sum(), ratio)
+    assert gradient.tolist() == pytest.approx(advantages.tolist())
 
 
 @pytest.mark.thesis("surrogate")
@@ -175,13 +119,6 @@ def test_the_value_loss_is_the_larger_of_plain_and_clipped(each_script):
     assert each_script.value_loss(new_values, values, returns, None).item() == pytest.approx(0.5 * (4 + 1) / 2)
     # Clipped to 0.1: errors 2.9² and 0.1², of which the larger with 2² and 1² counts
     assert each_script.value_loss(new_values, values, returns, 0.1).item() == pytest.approx(0.5 * (2.9**2 + 1) / 2)
-
-
-@pytest.mark.thesis("normalize")
-def test_normalised_advantages_have_mean_zero_and_deviation_one(each_script):
-    normalised = each_script.normalize(torch.tensor([1.0, 2.0, 3.0, 6.0]))
-    assert normalised.mean().item() == pytest.approx(0, abs=1e-6)
-    assert normalised.std().item() == pytest.approx(1)
 
 
 def test_the_change_of_the_policy_on_two_states_worked_out_by_hand(each_script):

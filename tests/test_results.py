@@ -17,7 +17,7 @@ from PIL import Image
 from torch.utils.tensorboard import SummaryWriter
 
 from benchmark import claims, collect, figures, report
-from conftest import ROOT
+from conftest import ROOT, cells
 
 BATCH = 1024  # agent steps of an iteration
 VERSIONS = {"python": "3.12", "torch": "2.13.0"}
@@ -77,11 +77,6 @@ def make_pairs(differences: dict[str, list[float]], iterations: int = 2) -> clai
 
 def contents(directory) -> dict[str, bytes]:
     return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
-
-
-def cells(markdown: str) -> list[list[str]]:
-    lines = [line for line in markdown.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
 def refusal(call_main, command, *flags) -> str:
@@ -384,9 +379,9 @@ def test_a_figure_says_games_seeds_units_and_keeps_its_colours(tmp_path):
 def test_equal_runs_make_equal_files_and_touch_no_other_set(tmp_path, call_main):
     for started, flags in ((1, []), (2, ["--note", "spo", "--challenger", "mine"])):
         before = contents(tmp_path)
-        for variant in ("ppo", "mine"):
-            make_training(tmp_path, variant, started=started, mean_return_100=[1, 2], kl=[0.1, 0.2])
-        call_main(report, "--out", ".", *flags)
+        columns = {"started": started, "mean_return_100": [1, 2], "kl": [0.1, 0.2]}
+        named = [str(make_training(tmp_path, variant, **columns)) for variant in ("ppo", "mine")]
+        call_main(report, *named, "--out", ".", *flags)
         made = contents(tmp_path)
         assert before.items() <= made.items()
         call_main(report, "--out", ".", *flags)
@@ -398,7 +393,12 @@ def test_equal_runs_make_equal_files_and_touch_no_other_set(tmp_path, call_main)
 def test_bad_input_is_refused_in_one_line(tmp_path, call_main):
     collect.collect(tmp_path, [make_training(tmp_path / "elsewhere", kl=[1], mean_return_100=[1])])
     (tmp_path / "README.md").write_text("<!-- end verdicts -->\n<!-- verdicts -->\n")  # nothing in between
-    flags = {"--note none": "the note none", "--note a/b": "letters", "--challenger x": "one of ppo", "": "between"}
+    flags = {
+        "--note none": "the note none",
+        "--note a/b": "the note a/b",
+        "--challenger x": "one of ppo",
+        "": "between",
+    }
     for given, words in flags.items():
         assert words in refusal(call_main, report, "--out", ".", *given.split())
 

@@ -154,13 +154,9 @@ def check_one_continuous_curve(logged: dict) -> None:
     assert values(logged, EVERY_ITERATION) == pytest.approx(rates, rel=1e-7)  # float32: one iteration is 1.3e-7
 
 
-def test_a_killed_run_that_is_resumed_is_one_continuous_curve(script, tmp_path, start, call_main):
-    check_one_continuous_curve(killed_and_resumed(script, tmp_path, start, call_main, kills=1))
-
-
-@pytest.mark.slow
-def test_a_run_killed_thirty_times_is_one_continuous_curve(script, tmp_path, start, call_main):
-    check_one_continuous_curve(killed_and_resumed(script, tmp_path, start, call_main, kills=30))
+@pytest.mark.parametrize("kills", [1, pytest.param(30, marks=pytest.mark.slow)])
+def test_a_killed_run_that_is_resumed_is_one_continuous_curve(script, kills, tmp_path, start, call_main):
+    check_one_continuous_curve(killed_and_resumed(script, tmp_path, start, call_main, kills))
 
 
 @pytest.fixture(scope="module")
@@ -229,10 +225,6 @@ def test_a_directory_without_a_checkpoint_is_refused(script, contents, tmp_path,
     assert ("it holds no checkpoint" if contents is None else "damaged") in said
 
 
-def test_a_directory_that_is_not_there_is_refused(script, call_main):
-    assert call_main(script, "--resume", "nowhere") == (2, "", "--resume nowhere: it holds no checkpoint.pt\n")
-
-
 def test_flipped_and_cut_checkpoints_are_refused_or_harmless(script, finished):
     """A byte of padding between the parts of the file may change; nothing that is read from it may."""
     path, offsets = finished / "checkpoint.pt", random.Random(3)
@@ -297,17 +289,6 @@ def test_a_signal_ends_the_run_with_a_checkpoint_and_a_command(script, number, t
     run_dir = run_dir_in(tmp_path / "runs")
     assert (status, out) == (128 + number, "") and said.endswith(f"--resume {run_dir} --stop-at 500000000\n")
     assert checkpoint_of(run_dir)["global_step"] == scalars(run_dir)[EVERY_ITERATION][-1][0] > 0
-
-
-def test_a_second_signal_a_second_later_ends_at_once(script, tmp_path, start):
-    """An agent step that takes an hour is not waited for."""
-    process = start(script, *flags_of(**{**CARTPOLE, "env_id": "tiny_envs:Stuck-v0"}, **CANNOT_END))
-    process.wait_for((tmp_path / "stuck").exists)
-    process.send_signal(signal.SIGINT)
-    assert "from step 0" in process.stderr.readline() and "another signal" in process.stderr.readline()
-    time.sleep(1.1)
-    process.send_signal(signal.SIGTERM)
-    assert process.end() == (128 + signal.SIGTERM, "", "")
 
 
 def test_two_signals_at_once_count_as_one(monkeypatch, capfd):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from conftest import ROOT
-from siblings import ACPPO, PPO, changed_definitions, changes, code_diff, lines_of, load
+from siblings import ACPPO, PPO, changes, code_diff, lines_of, load
 
 PLACES = {  # places that a hunk may touch: lines from the one to the other, the second not included
     "docstring": ('"""', "Sections: "),
@@ -85,8 +85,3 @@ def test_a_script_from_anywhere_can_import_the_files_beside_it(tmp_path, monkeyp
     (tmp_path / "my idea.py").write_text(PPO.read_text(encoding="utf-8").replace("def clip_range(", own))
     script = load(tmp_path / "my idea.py")
     assert (script.__name__, script.EPSILON, script.Args().exp_name) == ("my idea", 0.3, "my idea")
-
-
-def test_changed_definitions_are_known_by_their_text():
-    assert changed_definitions(ACPPO, PPO) == {"Args", "clip_range", "train"}
-    assert changed_definitions(PPO, PPO) == set()

@@ -1,7 +1,5 @@
 """The speed measurements: how the numbers are read, their tables, and one call as a user makes it."""
 
-import sys
-
 import pandas as pd
 import pytest
 import torch
@@ -12,7 +10,7 @@ import acppo_atari
 import bookkeeping
 import ppo_atari
 from benchmark import throughput
-from conftest import ROOT, train
+from conftest import ROOT, cells, train
 
 
 def processes(name: str, *rounds: list[float], **columns) -> pd.DataFrame:
@@ -32,10 +30,6 @@ def log_iterations(directory, ends: list[float], phases: dict[str, list[float]])
             writer.add_scalar(f"time/{phase}", seconds[i], 1000 * (i + 1), walltime=end)
     writer.close()
     return throughput.read_log(directory)
-
-
-def cells(markdown: str) -> list[list[str]]:
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in markdown.splitlines()]
 
 
 def test_rows_are_compared_round_by_round_with_first_row_and_peer():
@@ -94,17 +88,16 @@ def test_probes_give_a_speed():
     assert throughput.probe_emulator("breakout", 2, 1, block=2) > 0
 
 
-def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatch, capfd):
+def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatch, call_main):
     names, csv = ["acppo_atari.py --c 0", f"ppo_atari.py --resume {tmp_path}"], tmp_path / "throughput.csv"
     train(ppo_atari, tmp_path, env_id="CartPole-v1", num_envs=2, num_steps=128, total_timesteps=256)
     saved = (tmp_path / "checkpoint.pt").read_bytes()
     throughput.add_rows(csv, [{"candidate": "older, with phases of its own", "time/storage": 0.5}])
     flags = "--env-id CartPole-v1 --rounds 1 --warmup 1 --window 3 --num-envs 2 --threads 2".split()
     monkeypatch.chdir(ROOT)
-    monkeypatch.setattr(sys, "argv", ["throughput.py", *names, *flags, "--csv", str(csv)])
-    throughput.main()
+    printed = call_main(throughput, *names, *flags, "--csv", str(csv)).out
     assert (tmp_path / "checkpoint.pt").read_bytes() == saved  # a copy is resumed
-    tables = [cells(block) for block in capfd.readouterr().out.split("\n\n") if block.startswith("|")]
+    tables = [cells(block) for block in printed.split("\n\n") if block.startswith("|")]
     assert len(tables) == 2  # speed and phases; no limits outside Atari
     assert all([line[:4] for line in table[2:]] == [[name, "2", "2", "1"] for name in names] for table in tables)
     older, rows = (table := pd.read_csv(csv))[:1].dropna(axis=1), table[1:].reset_index()
@@ -127,22 +120,17 @@ def test_call_prints_tables_and_adds_a_row_for_each_process(tmp_path, monkeypatc
         (["script.py", "--cleanrl", "."], "there is no cleanrl/ppo_atari.py in it"),
     ],
 )
-def test_bad_input_is_refused_and_leaves_nothing(flags, said, tmp_path, monkeypatch, capfd):
-    monkeypatch.chdir(tmp_path)
+def test_bad_input_is_refused_and_leaves_nothing(flags, said, tmp_path, call_main):
     (tmp_path / "script.py").touch()
-    monkeypatch.setattr(sys, "argv", ["throughput.py", *flags, "--csv", "x.csv"])
-    with pytest.raises(SystemExit) as exit_:
-        throughput.main()
-    assert exit_.value.code == 2 and said in capfd.readouterr().err
+    ended = call_main(throughput, *flags, "--csv", "x.csv")
+    assert ended.status == 2 and said in ended.err
     assert [path.name for path in tmp_path.iterdir()] == ["script.py"]
 
 
-def test_failing_process_ends_the_call_and_rows_before_it_stay(tmp_path, monkeypatch):
+def test_failing_process_ends_the_call_and_rows_before_it_stay(tmp_path, monkeypatch, call_main):
     answers, run_jobs = [[{"steps_per_second": 1.0}]], throughput.run_jobs  # the first one is not run
     monkeypatch.setattr(throughput, "run_jobs", lambda *words: answers.pop() if answers else run_jobs(*words))
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "script.py").write_text("raise SystemExit(3)")
-    monkeypatch.setattr(sys, "argv", "x script.py script.py --env-id CartPole-v1 --csv x.csv".split())
-    with pytest.raises(SystemExit, match=r"\(2\) ended with status 3"):
-        throughput.main()
+    ended = call_main(throughput, *"script.py script.py --env-id CartPole-v1 --csv x.csv".split())
+    assert "(2) ended with status 3" in ended.status
     assert list(pd.read_csv("x.csv").commit) == ["unknown"]  # of the script's directory, which is no checkout

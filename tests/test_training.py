@@ -27,37 +27,6 @@ def test_acppo_with_c_zero_equals_ppo_bitwise(arguments, tmp_path):
     assert values(ppo, "losses/clipfrac").size == 2
 
 
-def test_acppo_with_c_one_does_not_equal_ppo(tmp_path):
-    """So that the test above can fail."""
-    ppo = train(ppo_atari, tmp_path / "ppo", **CARTPOLE)
-    acppo = train(acppo_atari, tmp_path / "acppo", **CARTPOLE)
-    assert not np.array_equal(values(ppo, "losses/kl"), values(acppo, "losses/kl"))
-
-
-def test_the_same_seed_gives_the_same_numbers_and_another_seed_others(script, tmp_path):
-    first, again, other = (
-        train(script, tmp_path / name, seed=seed, **CARTPOLE)
-        for name, seed in (("first", 5), ("again", 5), ("other", 6))
-    )
-    assert reproducible(first) == reproducible(again)
-    assert not np.array_equal(values(first, "losses/value_loss"), values(other, "losses/value_loss"))
-
-
-def test_with_learning_rate_zero_the_policy_does_not_move(script, tmp_path):
-    logged = train(script, tmp_path, learning_rate=0.0, **CARTPOLE)
-    for tag in ("kl", "old_approx_kl", "approx_kl", "tv_distance", "max_tv_distance"):
-        assert np.abs(values(logged, f"losses/{tag}")).max() < 1e-6
-    assert np.abs(values(logged, "losses/clipfrac")).max() == 0
-
-
-def test_the_average_clip_ratio_lies_between_its_bounds(tmp_path):
-    epsilon, c = 0.16, 1.0
-    logged = train(acppo_atari, tmp_path, clip_coef=epsilon, c=c, **{**CARTPOLE, "total_timesteps": 1280})
-    averages = values(logged, "losses/avg_clip_ratio")
-    assert len(averages) == 10
-    assert (epsilon / (1 + c) < averages).all() and (averages <= epsilon).all()
-
-
 def test_cartpole_is_learnt(script, tmp_path):
     logged = train(script, tmp_path, env_id="CartPole-v1", total_timesteps=60_000)
     assert values(logged, "charts/mean_return_100")[-1] > 150
@@ -71,13 +40,6 @@ def test_the_readmes_flags_for_vectors_solve_cartpole(script, tmp_path):
     assert values(logged, "charts/mean_return_100")[-1] >= 450  # of 500
 
 
-@pytest.mark.parametrize("env_id", ["FrozenLake-v1", "Taxi-v4", "CliffWalking-v1", "Blackjack-v1", "Acrobot-v1"])
-def test_environments_with_all_kinds_of_numbers_move_the_policy(script, env_id, tmp_path):
-    logged = train(script, tmp_path, env_id=env_id, num_envs=2, num_steps=16, total_timesteps=64)
-    kl = values(logged, "losses/kl")
-    assert len(kl) == 2 and (kl > 0).all()
-
-
 def test_the_learning_rate_falls_linearly_over_all_steps(script, tmp_path):
     logged = train(script, tmp_path, learning_rate=0.01, **{**CARTPOLE, "total_timesteps": 640})
     steps, rates = zip(*logged["charts/learning_rate"])
@@ -85,17 +47,6 @@ def test_the_learning_rate_falls_linearly_over_all_steps(script, tmp_path):
     assert rates == pytest.approx((0.01, 0.008, 0.006, 0.004, 0.002))
     constant = train(script, tmp_path / "constant", learning_rate=0.01, anneal_lr=False, **CARTPOLE)
     assert values(constant, "charts/learning_rate") == pytest.approx([0.01, 0.01])
-
-
-def test_a_target_kl_skips_the_remaining_epochs(script, tmp_path, monkeypatch):
-    calls = []
-    surrogate = script.surrogate
-    monkeypatch.setattr(script, "surrogate", lambda *given: calls.append(1) or surrogate(*given))
-    train(script, tmp_path / "met", target_kl=1e-9, **ONE_ROLLOUT)
-    assert len(calls) == 4  # one epoch of four minibatches
-    calls.clear()
-    train(script, tmp_path / "far", target_kl=1e9, **ONE_ROLLOUT)
-    assert len(calls) == 16
 
 
 class Recorder:
@@ -122,7 +73,7 @@ def log_softmax(logits: torch.Tensor) -> np.ndarray:
 )
 def test_every_logged_metric_is_what_it_is_defined_to_be(script, arguments, tmp_path, monkeypatch):
     """One iteration with a large step; its rollout is kept, and each number worked out again in numpy."""
-    args = script.Args(threads=1, learning_rate=0.01, clip_coef=0.1, **arguments)
+    args = script.Args(threads=1, seed=3, learning_rate=0.01, clip_coef=0.1, **arguments)
     torch.manual_seed(args.seed)
     envs = make_envs(args.env_id, args.num_envs)
     before = script.Agent(envs.single_observation_space.shape, 2)  # the same first draws as in train
@@ -165,25 +116,6 @@ def test_every_logged_metric_is_what_it_is_defined_to_be(script, arguments, tmp_
         assert logged[f"losses/{name}"] == pytest.approx(value, rel=1e-3, abs=1e-6), name
 
 
-@pytest.mark.thesis("surrogate", "value_loss")
-def test_the_first_minibatch_is_fitted_to_the_rollout_itself(script, tmp_path, monkeypatch):
-    """One minibatch, one epoch: the ratios are 1 and the values the rollout's, so that the losses have closed forms."""
-    arguments = {**ONE_ROLLOUT, "num_minibatches": 1, "update_epochs": 1, "norm_adv": False}
-    gae = Recorder(monkeypatch, script, "compute_gae")
-    torch.manual_seed(1)
-    before = script.Agent((4,), 2)
-    rollout = Recorder(monkeypatch, script, "act")
-    logged = train(script, tmp_path / "raw", **arguments)
-    advantages = gae.calls[0][1].numpy()
-    policy = log_softmax(before(torch.cat([given[1] for given, _ in rollout.calls]))[0])
-    assert abs(advantages.mean()) > 0.1
-    assert values(logged, "losses/policy_loss") == pytest.approx([-advantages.mean()], rel=1e-4)
-    assert values(logged, "losses/value_loss") == pytest.approx([0.5 * (advantages**2).mean()], rel=1e-4)
-    assert values(logged, "losses/entropy") == pytest.approx([-(np.exp(policy) * policy).sum(1).mean()], rel=1e-5)
-    normalised = train(script, tmp_path / "normalised", **{**arguments, "norm_adv": True})
-    assert values(normalised, "losses/policy_loss") == pytest.approx([0], abs=1e-5)
-
-
 def test_the_loss_is_the_weighted_sum_of_its_parts(script, tmp_path, monkeypatch):
     """In the first minibatch, whose policy is the new network's; whatever the surrogate and the value loss are."""
     weights = {"vf_coef": 0.7, "ent_coef": 0.3}
@@ -193,7 +125,8 @@ def test_the_loss_is_the_weighted_sum_of_its_parts(script, tmp_path, monkeypatch
     objective, fit = Recorder(monkeypatch, script, "surrogate"), Recorder(monkeypatch, script, "value_loss")
     losses, backward = [], torch.Tensor.backward
     monkeypatch.setattr(torch.Tensor, "backward", lambda loss: losses.append(loss.item()) or backward(loss))
-    train(script, tmp_path, **{**ONE_ROLLOUT, "num_minibatches": 1, "update_epochs": 1}, norm_adv=False, **weights)
+    arguments = {**ONE_ROLLOUT, "num_minibatches": 1, "update_epochs": 1}
+    logged = train(script, tmp_path, norm_adv=False, **arguments, **weights)
     policy = log_softmax(before(torch.cat([given[1] for given, _ in rollout.calls]))[0])
     entropy = -(np.exp(policy) * policy).sum(1).mean()
     surrogate, value_loss = objective.calls[0][1].mean().item(), fit.calls[0][1].item()
@@ -201,15 +134,15 @@ def test_the_loss_is_the_weighted_sum_of_its_parts(script, tmp_path, monkeypatch
     assert value_loss > 0.1 and entropy > 0.1
     why = "if a further term is the script's idea, leave this test out by --deselect"
     assert losses == [pytest.approx(expected, rel=1e-4)], why
+    assert values(logged, "losses/entropy") == pytest.approx([entropy], rel=1e-5)
 
 
 def test_every_epoch_takes_every_sample_once_in_an_order_of_its_own(script, tmp_path, monkeypatch):
-    objective = Recorder(monkeypatch, script, "surrogate")
+    objective, gae = Recorder(monkeypatch, script, "surrogate"), Recorder(monkeypatch, script, "compute_gae")
     train(script, tmp_path, norm_adv=False, **ONE_ROLLOUT)
     epochs = torch.cat([given[1] for given, _ in objective.calls]).reshape(4, 128)
-    for epoch in epochs[1:]:
-        assert torch.equal(epoch.sort().values, epochs[0].sort().values)
-        assert not torch.equal(epoch, epochs[0])
+    for epoch, before in zip(epochs, [gae.calls[0][1].flatten(), *epochs]):
+        assert torch.equal(epoch.sort().values, before.sort().values) and not torch.equal(epoch, before)
 
 
 @pytest.mark.parametrize(("clip_vloss", "expected"), [(True, 0.3), (False, None)])
@@ -221,9 +154,10 @@ def test_the_value_loss_is_clipped_unless_it_is_switched_off(script, clip_vloss,
 
 def test_the_gradients_norm_is_clipped_and_logged_as_it_was(script, tmp_path):
     """At learning rate 0 a training with a norm that nothing exceeds has the same gradients."""
-    norms = []
+    norms, epsilons = [], set()
 
     def keep_norm(optimizer, *_):
+        epsilons.add(optimizer.param_groups[0]["eps"])
         gradients = [parameter.grad.flatten() for group in optimizer.param_groups for parameter in group["params"]]
         norms.append(torch.cat(gradients).norm().item())
 
@@ -235,6 +169,7 @@ def test_the_gradients_norm_is_clipped_and_logged_as_it_was(script, tmp_path):
     free, clipped = np.split(np.array(norms), 2)
     assert clipped == pytest.approx([0.02] * 32, rel=1e-3)
     assert values(logged, "losses/grad_norm") == pytest.approx(free.reshape(2, 16).mean(1), rel=1e-4)
+    assert epsilons == {1e-5}  # OpenAI's baselines' and CleanRL's; torch's own is 1e-8
 
 
 @pytest.mark.thesis("Agent")
@@ -246,17 +181,18 @@ def test_every_rollout_under_bfloat16_is_of_the_latest_policy(script, tmp_path, 
     assert (first - 1).abs().max() < 0.05 < (last - 1).abs().max()
 
 
-def test_rewards_and_scores_are_those_of_the_environments(script, tmp_path, monkeypatch):
+def test_actions_rewards_and_scores_are_those_of_the_environments(script, tmp_path, monkeypatch):
     """The environments are played again with the recorded actions."""
-    args = script.Args(env_id=SHORT_CARTPOLE, num_envs=8, num_steps=64, total_timesteps=2048, threads=1)
+    args = script.Args(env_id=SHORT_CARTPOLE, num_envs=8, num_steps=64, total_timesteps=2048, seed=5, threads=1)
     rollout, gae = Recorder(monkeypatch, script, "act"), Recorder(monkeypatch, script, "compute_gae")
     with open_run(script, tmp_path) as run:
         script.train(args, make_envs(SHORT_CARTPOLE, 8), run)
     envs = make_envs(SHORT_CARTPOLE, 8)
-    envs.reset(seed=env_seeds(args.seed, 8))
+    obs, _ = envs.reset(seed=env_seeds(args.seed, 8))
     rewards, scores, lengths = [], [], []
-    for t, (_, (actions, _, _)) in enumerate(rollout.calls, start=1):
-        _, reward, terminated, truncated, infos = envs.step(actions.numpy())
+    for t, (given, (actions, _, _)) in enumerate(rollout.calls, start=1):
+        assert np.array_equal(given[1], obs)  # also where a rollout begins
+        obs, reward, terminated, truncated, infos = envs.step(actions.numpy())
         rewards.append(reward)
         for n in np.flatnonzero(terminated | truncated):
             scores.append((8 * t, infos["episode"]["r"][n]))
@@ -305,7 +241,7 @@ def test_speed_and_phases_are_the_times_that_their_parts_take(script, tmp_path, 
 
 
 def test_the_variance_of_equal_returns_leaves_nothing_to_explain(script, tmp_path):
-    logged = train(script, tmp_path, gae_lambda=0.0, **{**ONE_ROLLOUT, "env_id": "tiny_envs:RewardNothing-v0"})
+    logged = train(script, tmp_path, gamma=0.0, gae_lambda=0.0, **{**ONE_ROLLOUT, "env_id": "tiny_envs:Endless-v0"})
     assert np.isnan(values(logged, "losses/explained_variance")).all()
 
 
@@ -347,37 +283,8 @@ def test_advantages_are_normalised_within_each_minibatch(script, tmp_path, monke
     assert minibatches.mean(1).abs().max() < 1e-5 and (minibatches.std(1) - 1).abs().max() < 1e-4
 
 
-def test_each_step_of_adam_follows_the_gradient_of_its_own_minibatch(script, tmp_path):
-    """At learning rate 0 all epochs have the same gradient; gradients that added up would grow from one to the next."""
-    seen = []
-
-    def keep(optimizer, *_):
-        gradients = [parameter.grad.flatten() for parameter in optimizer.param_groups[0]["params"]]
-        seen.append((torch.cat(gradients).norm().item(), optimizer.param_groups[0]["eps"]))
-
-    hook = register_optimizer_step_pre_hook(keep)
-    arguments = {**CARTPOLE, "total_timesteps": 128, "num_minibatches": 1, "update_epochs": 3}
-    train(script, tmp_path, learning_rate=0.0, max_grad_norm=1e9, **arguments)
-    hook.remove()
-    norms, epsilons = zip(*seen)
-    assert norms[0] > 0.01 and norms == pytest.approx([norms[0]] * 3, rel=1e-3)
-    assert epsilons == (1e-5,) * 3  # OpenAI's baselines' and CleanRL's; torch's own is 1e-8
-
-
-def test_every_action_is_chosen_on_the_observation_before_it(script, tmp_path, monkeypatch):
-    """The environments are played again with the recorded actions, across the border of two rollouts."""
-    rollout = Recorder(monkeypatch, script, "act")
-    train(script, tmp_path, **CARTPOLE)
-    envs = make_envs("CartPole-v1", 4)
-    obs, _ = envs.reset(seed=env_seeds(1, 4))
-    assert len(rollout.calls) == 64
-    for given, (actions, _, _) in rollout.calls:
-        assert np.array_equal(given[1], obs)
-        obs, *_ = envs.step(actions.numpy())
-
-
 def test_a_target_kl_is_held_against_the_mean_over_an_epoch(script, tmp_path, monkeypatch):
-    """The target lies between that mean and the KL of the epoch's last minibatch, of a seed that has them far apart."""
+    """Of a seed whose last minibatch has another KL than the mean: the targets have the mean alone between them."""
     objective = Recorder(monkeypatch, script, "surrogate")
     arguments = {**CARTPOLE, "total_timesteps": 128, "learning_rate": 0.01}
     for seed in range(1, 21):
@@ -390,9 +297,10 @@ def test_a_target_kl_is_held_against_the_mean_over_an_epoch(script, tmp_path, mo
             break
     else:
         pytest.fail("no seed of 20 has the two apart")
-    objective.calls.clear()
-    train(script, tmp_path / "between", target_kl=(mean + last) / 2, seed=seed, **arguments)
-    assert (len(objective.calls) == 4) == (mean > last)
+    for target in (0.9 * mean, 1.1 * mean):
+        objective.calls.clear()
+        train(script, tmp_path / f"target {target}", target_kl=target, seed=seed, **arguments)
+        assert (len(objective.calls) == 4) == (target < mean)
 
 
 @pytest.mark.thesis("Agent", "orthogonal", "tanh_mlp")

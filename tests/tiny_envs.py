@@ -74,50 +74,11 @@ class Endless(gym.Env):
         return np.zeros(2, np.float32), 0.0, False, False, {}
 
 
-class Stuck(Endless):
-    """The fifth step of a game takes an hour."""
-
-    def step(self, action):
-        if self.steps == 4:
-            Path("stuck").touch()
-            time.sleep(3600)
-        return super().step(action)
-
-
-class RewardNothing(gym.Env):
-    """Every step ends an episode with no reward, so that all returns are 0."""
-
-    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        return np.zeros(1, np.float32), 0.0, True, False, {}
-
-
-class CountsFromFive(gym.Env):
-    """Its actions are 5 and 6; anything else is an error."""
-
-    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2, start=5)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
-
-    def step(self, action):
-        assert action in self.action_space
-        return np.zeros(1, np.float32), float(action), False, False, {}
-
-
 class Shows(gym.Env):
-    """Observes samples of a space, and pays 1 for an action of its own space, int8; anything else is an error."""
+    """Observes samples of a space, and pays an action's number; an action of another space, or type, is an error."""
 
-    action_space = Discrete(2, dtype=np.int8)
-
-    def __init__(self, space: gym.Space):
-        self.observation_space = space
+    def __init__(self, space: gym.Space, start: int = 0):
+        self.observation_space, self.action_space = space, Discrete(2, start=start, dtype=np.int8)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)
@@ -125,7 +86,7 @@ class Shows(gym.Env):
 
     def step(self, action):
         assert action in self.action_space
-        return self.observation_space.sample(), 1.0, False, False, {}
+        return self.observation_space.sample(), float(action), False, False, {}
 
 
 NUMBERS = {
@@ -144,19 +105,6 @@ NO_NUMBERS = {
     "Either": OneOf([Discrete(2), Box(0, 1, (2,))]),
     "Empty": Box(0, 1, (0,)),
 }
-
-
-class CannotStart(gym.Env):
-    """Fails when it is built, or when it is reset."""
-
-    observation_space, action_space = Box(-1, 1, (1,)), Discrete(2)
-
-    def __init__(self, fails_in: str):
-        if fails_in == "init":
-            raise RuntimeError("no such\nlevel")
-
-    def reset(self, *, seed=None, options=None):
-        raise FileNotFoundError("level.txt")
 
 
 class Awkward(gym.Env):
@@ -218,16 +166,12 @@ class Awkward(gym.Env):
 TRAITS = ["takes signals", "forks", "draws globally", "raises", "exits", "leaves", "is old", "renders no more"]
 for trait in [*TRAITS, "does not close", "exists once"]:
     gym.register(f"{trait.title().replace(' ', '')}-v0", Awkward, disable_env_checker=True, kwargs={"trait": trait})
-gym.register("CannotBeBuilt-v0", CannotStart, kwargs={"fails_in": "init"})
-gym.register("CannotBeReset-v0", CannotStart, kwargs={"fails_in": "reset"})
-gym.register("CountsFromFive-v0", CountsFromFive)
+gym.register("CountsFromFive-v0", Shows, kwargs={"space": Box(-1, 1, (1,)), "start": 5})
 gym.register("Endless-v0", Endless)
 gym.register("RenderedPixels-v0", RenderedPixels, max_episode_steps=20)
-gym.register("RewardNothing-v0", RewardNothing)
 gym.register("SameGame-v0", TinyPixels, max_episode_steps=2, kwargs={"start": 2})  # of two steps, whatever the seed
 gym.register("ShortCartPole-v0", "gymnasium.envs.classic_control.cartpole:CartPoleEnv", max_episode_steps=15)
 gym.register("ShowsMuch-v0", Shows, kwargs={"space": Box(-1, 1, (1_000_000,))})
-gym.register("Stuck-v0", Stuck)
 for name, space in (NUMBERS | NO_NUMBERS).items():
     gym.register(f"Shows{name}-v0", Shows, kwargs={"space": space})
 gym.register("TinyPixels-v0", TinyPixels, max_episode_steps=20)

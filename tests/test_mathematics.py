@@ -1,5 +1,6 @@
 """The pure functions of the scripts, against brute force, closed forms and numbers worked out by hand."""
 
+import inspect
 import math
 
 import numpy as np
@@ -96,11 +97,12 @@ def test_a_large_c_approaches_the_product_only_objective():
 def test_a_policy_that_has_not_moved_gets_the_policy_gradient(each_script):
     """At ρ = 1 it is Â, for PPO and all its kin: they differ in how they brake from there on."""
     ratio, advantages = torch.ones(4, requires_grad=True), torch.tensor([-2.0, -0.5, 0.5, 2.0])
+    given = ratio, advantages, torch.tensor([0.05, 0.3, 0.05, 0.3])
     try:
-        objective = each_script.surrogate(ratio, advantages, torch.tensor([0.05, 0.3, 0.05, 0.3]))
+        inspect.signature(each_script.surrogate).bind(*given)
     except TypeError as error:
         pytest.skip(f"its surrogate takes other arguments ({error})")
-    (gradient,) = torch.autograd.grad(objective.sum(), ratio)
+    (gradient,) = torch.autograd.grad(each_script.surrogate(*given).sum(), ratio)
     assert gradient.tolist() == pytest.approx(advantages.tolist())
 
 

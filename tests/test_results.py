@@ -388,6 +388,9 @@ def test_equal_runs_make_equal_files_and_touch_no_other_set(tmp_path, call_main)
         assert contents(tmp_path) == made
     assert made.keys() > {f"figures/{of}unfinished/{name}.png" for name in figures.FIGURES for of in ("", "spo-")}
     assert all("| CartPole-v1 | mine |" in made[page].decode() for page in ("README.md", "spo.md"))
+    make_training(tmp_path, seed=2, kl=[1])  # new, and not named
+    call_main(report, "--out", ".", *flags)
+    assert ("ppo", "CartPole-v1", 2) in collect.read_runs(tmp_path)[0]
 
 
 def test_bad_input_is_refused_in_one_line(tmp_path, call_main):

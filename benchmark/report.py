@@ -259,8 +259,8 @@ def page_parts(stages: list[Stage], challengers: tuple[str, ...], prefix: str = 
             opening = [*verdicts, LEGEND, score_figure]
         else:
             results += [*verdicts, score_figure]
-        results += [score_table(stage.compared), published_table(stage.compared)]
-        results += [atari5_table(stage.compared)] if stage.name == "finished" else []
+        results.append(score_table(stage.compared))
+        results += [published_table(stage.compared), atari5_table(stage.compared)] if stage.name == "finished" else []
         results += [kl_figure, kl_table(stage), clip_figure, *of_games, progress_table(stage)]
     return {"verdicts": "\n".join(opening), "results": "\n".join(filter(None, results))}
 

@@ -100,7 +100,7 @@ def read_training(directory: Path) -> tuple[dict, pd.DataFrame]:
         "steps": int(curve.index[-1]),
         "total_timesteps": args["total_timesteps"],
         **{name: provenance.pop(name) for name in ("commit", "machine", "threads")},
-        "hours": {"wall": round(wall, 3), "core": round(wall * args["threads"], 3)},
+        "hours": round(wall, 3),
         "evaluation": read_evaluation(directory / "eval.csv"),
         # Without the directory that it was logged to: a path of one machine, which tells nothing of the run
         "command": shlex.join(word for word in shlex.split(about["command"]) if not word.startswith("--log-dir=")),

@@ -126,9 +126,9 @@ def run_table(runs: Runs, curves: Curves) -> str:
         row = [key[1], key[0], str(key[2]), f"{run['steps']:,}", score(curve.mean_return_100.iloc[-1])]
         row += [f"{score(played['mean'], played['std'])} (n = {played['games']})" if played else "–"]
         row += [cell(curve.kl.clip(lower=claims.LEAST_KL).mean(), ".3g"), ", ".join(["; ".join(machines), *arithmetic])]
-        row += [f"{run['hours']['wall']:.1f}" if run["hours"] else "–"]
+        row += [f"{run['hours']:.1f}" if run["hours"] else "–"]
         rows.append([*row, re.sub(r"\b([0-9a-f]{7})[0-9a-f]{33}", r"\1", run["commit"])])
-    hours = [run["hours"]["wall"] for run in runs.values() if run["hours"]]
+    hours = [run["hours"] for run in runs.values() if run["hours"]]
     known = f"; hours are known of {len(hours)} of {len(runs)}, together {sum(hours):.1f}" if hours else ""
     title = f"What each run came to and cost{known}"
     columns = ["game", "variant", "seed", "agent steps", "final score", "without learning", "mean KL", "machine"]
